@@ -13,9 +13,11 @@ import math
 from router.compiler.expressions import ExpressionError, Scope, tree
 from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
 from router.compiler.expressions.kinds import (
+    DURATION_TYPES,
     INT32,
     INT64,
     OCTET,
+    PROTOBUF_DURATION,
     STAMP_TYPES,
     BoolKind,
     BytesKind,
@@ -36,6 +38,8 @@ from router.compiler.expressions.scope import field_of, require_readable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+
+_SECONDS = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
 
 _EXACT_INTEGER_BITS = {32: 24, 64: 53}
 """Integers of up to this many bits are exact in a float of that width."""
@@ -69,9 +73,11 @@ def unset(member: Field, span: SourceSpan) -> Unset:
 
 
 def _to_message(value: tree.Node, target: MessageType, scope: Scope) -> Plan:
-    if isinstance(value.kind, TimeKind) and target.name in STAMP_TYPES:
+    if isinstance(value.kind, TimeKind) and target.name in STAMP_TYPES | DURATION_TYPES:
         return _to_time(value, target)
     if isinstance(value.kind, MessageKind):
+        if {value.kind.type.name, target.name} in (STAMP_TYPES, DURATION_TYPES):
+            return _to_time(_nanoseconds(value, value.kind.type), target)
         return _to_same_named(value, value.kind.type, target, scope)
     if len(target.fields) == 1:
         (only,) = target.fields
@@ -81,20 +87,48 @@ def _to_message(value: tree.Node, target: MessageType, scope: Scope) -> Plan:
     raise mismatch(value, target, "map its fields one by one")
 
 
-def _to_time(value: tree.Node, target: MessageType) -> Record:
-    def part(member: Field, operator: tree.Operator, kind: IntKind) -> tuple[Field, Plan]:
-        made = tree.Binary(kind, value.span, operator, value, tree.whole(NS_PER_SECOND, value.span))
-        assert isinstance(member.type, Int)  # noqa: S101 - times are made of integers
-        limits = _range(member.type)
-        return member, Leaf(member.type, made if limits.holds(kind) else fitted(made, limits), value.span)
+def _nanoseconds(value: tree.Node, moment: MessageType) -> tree.Node:
+    """Return a Timestamp or Duration of protobuf in nanoseconds. What ROS cannot hold is rejected at run time."""
+    seconds, nanos = (field_of(value, member, value.span) for member in moment.fields)
+    least = 0 if moment.name in STAMP_TYPES else 1 - NS_PER_SECOND
+    whole = _with_number(INT64, fitted(seconds, INT32), tree.Operator.MULTIPLY, NS_PER_SECOND)
+    return tree.Binary(INT64, value.span, tree.Operator.ADD, whole, fitted(nanos, IntKind(least, NS_PER_SECOND - 1)))
 
-    sec, nanosec = target.fields
-    seconds = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
-    members = (
-        part(sec, tree.Operator.FLOOR_DIVIDE, seconds),
-        part(nanosec, tree.Operator.MODULO, IntKind(0, NS_PER_SECOND - 1)),
+
+def _to_time(value: tree.Node, target: MessageType) -> Record:
+    """Fill seconds and nanoseconds from nanoseconds. Seconds that do not fit are rejected at run time."""
+    parts = _signed_parts(value) if target.name == PROTOBUF_DURATION else _parts(value)
+    members = zip(target.fields, parts, strict=True)
+    return Record(target, tuple((member, _part(member.type, made)) for member, made in members), value.span)
+
+
+def _parts(value: tree.Node) -> tuple[tree.Binary, tree.Binary]:
+    """Return whole seconds, rounded down, and nanoseconds."""
+    return (
+        _with_number(_SECONDS, value, tree.Operator.FLOOR_DIVIDE, NS_PER_SECOND),
+        _with_number(IntKind(0, NS_PER_SECOND - 1), value, tree.Operator.MODULO, NS_PER_SECOND),
     )
-    return Record(target, members, value.span)
+
+
+def _signed_parts(value: tree.Node) -> tuple[tree.Binary, tree.Binary]:
+    """Return whole seconds, rounded towards zero, and nanoseconds of the same sign."""
+    span = value.span
+    is_negative = tree.Compare(BoolKind(), span, (tree.Relation.LESS,), (value, tree.whole(0, span)))
+    raised = _with_number(INT64, value, tree.Operator.ADD, NS_PER_SECOND - 1)
+    seconds, _ = _parts(tree.Choice(INT64, span, is_negative, raised, value))
+    whole = _with_number(INT64, seconds, tree.Operator.MULTIPLY, NS_PER_SECOND)
+    return seconds, tree.Binary(IntKind(1 - NS_PER_SECOND, NS_PER_SECOND - 1), span, tree.Operator.SUBTRACT, value, whole)
+
+
+def _with_number(kind: IntKind, left: tree.Node, operator: tree.Operator, right: int) -> tree.Binary:
+    return tree.Binary(kind, left.span, operator, left, tree.whole(right, left.span))
+
+
+def _part(declared: Type, made: tree.Binary) -> Leaf:
+    assert isinstance(declared, Int)  # noqa: S101 - times are made of integers
+    assert isinstance(made.kind, IntKind)  # noqa: S101
+    limits = _range(declared)
+    return Leaf(declared, made if limits.holds(made.kind) else fitted(made, limits), made.span)
 
 
 def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
@@ -103,11 +137,7 @@ def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, s
         given = same_named(value, member)
         members.append((member, _to_member(given, member, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
-        is_time = {source.name, target.name} == STAMP_TYPES
-        hint = (
-            "write {sec: clamp(x.seconds), nanosec: clamp(x.nanos)}" if is_time else "they have no field name in common"
-        )
-        raise mismatch(value, target, hint)
+        raise mismatch(value, target, "they have no field name in common")
     return Record(target, tuple(members), value.span)
 
 

@@ -241,6 +241,8 @@ class Language:
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
 
     def _value(self, noise: random.Random, target: Type, depth: int) -> str:
+        if not self.is_ros and str(target) in _OF_PROTOBUF and noise.randrange(2):
+            return noise.choice(_OF_PROTOBUF[str(target)])
         return self._completed(noise, noise.choice(_of_frames(target) if self.is_frame else _filling(target)), depth)
 
     def _completed(self, noise: random.Random, template: str, depth: int) -> str:
@@ -292,11 +294,23 @@ def _filling(target: Type) -> Sequence[str]:  # noqa: C901 - a case a type
         case Enum():
             return ("round(float64({i}))", "clamp({i}, -8, 301)", "{i}", "wrap({i}, 0, 5)", "name", "{s}")
         case MessageType():
-            return ("{t}",) if target == TIME else ("inner", "message.inner", "inners[0]", "inners[1]")
+            if target in (TIME, DURATION) or target.name.startswith("google.protobuf."):
+                return ("{t}",)
+            return ("inner", "message.inner", "inners[0]", "inners[1]")
+        case List(MessageType() as of) if of == DURATION:
+            return ("[{t}, {t}]", "[]")
         case List(MessageType() as of):
             return ("pairs",) if of.is_map_entry else ("inners", "[inner, inners[0]]", "[inner]")
         case List():
             return [_raised(template) for template in _filling(target.element)]
+
+
+_OF_PROTOBUF: Mapping[str, Sequence[str]] = {
+    str(TIME): ("moment", "message.moment"),
+    str(DURATION): ("lapse", "lapses[1]"),
+    str(List(DURATION)): ("lapses", "[lapse, lapses[0]]"),
+}
+"""Times and durations of protobuf, by the type that they fill."""
 
 
 def _of_frames(target: Type) -> Sequence[str]:
@@ -326,11 +340,11 @@ def _raised(template: str) -> str:
 # ---- what is filled
 
 _SCALARS: Sequence[Type] = (
-    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME, INNER,
+    Bool(), I8, U8, I16, U16, I32, U32, I64, U64, F32, F64, F64, String(), String(5), TIME, DURATION, INNER,
 )  # fmt: skip
 _LISTS: Sequence[Type] = (
     List(U8), List(I16, 2), List(I32), List(I64), List(U64, None, 2), List(F32), List(F64), List(F64, 3), List(Bool()),
-    List(String()), List(String(4), None, 3), List(INNER), List(INNER, 2), List(INNER, None, 2),
+    List(String()), List(String(4), None, 3), List(DURATION), List(INNER), List(INNER, 2), List(INNER, None, 2),
 )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ SOURCE = MessageType(
     ),
 )  # fmt: skip
 TIME = MessageType("builtin_interfaces/msg/Time", (Field("sec", Int(32, True)), Field("nanosec", Int(32, False))))
+DURATION = MessageType("builtin_interfaces/msg/Duration", TIME.fields)
 ROS_POINT = MessageType("m/msg/Point", (Field("x", Float(64)), Field("z", Float(64))))
 ROS_ENTRY = MessageType("m/msg/Entry", (Field("key", String()), Field("value", Int(32, True))))
 ROS_ONE = MessageType("m/msg/One", (Field("data", Int(8, False)),))
@@ -213,16 +214,15 @@ def test_refusal_says_what_to_do() -> None:
         assert hint in finding.hint
 
 
-def test_what_is_said_of_a_timestamp_fills_a_time() -> None:
-    timestamp = MessageType(
-        "google.protobuf.Timestamp", (Field("seconds", Int(64, True)), Field("nanos", Int(32, True)))
-    )
-    stamped = MessageType("Stamped", (Field("x", timestamp),))
-    declared = MessageType("m/msg/It", (Field("it", TIME),))
-    (finding,) = findings_of(field_map(it="x"), declared, scope_of(stamped))
-    assert "sec: clamp(x.seconds), nanosec: clamp(x.nanos)" in finding.hint
-    filled = field_map(it__sec="clamp(x.seconds)", it__nanosec="clamp(x.nanos)")
-    assert not findings_of(filled, declared, scope_of(stamped))
+def moment(name: str) -> MessageType:
+    return MessageType(f"google.protobuf.{name}", (Field("seconds", Int(64, True)), Field("nanos", Int(32, True))))
+
+
+@pytest.mark.parametrize(("made", "declared"), [("Timestamp", DURATION), ("Duration", TIME)])
+def test_a_point_in_time_is_no_duration(made: str, declared: MessageType) -> None:
+    source = MessageType("Stamped", (Field("x", moment(made)),))
+    (finding,) = findings_of(field_map(it="x"), MessageType("m/msg/It", (Field("it", declared),)), scope_of(source))
+    assert finding.code is Code.TYPE_MISMATCH
 
 
 @pytest.mark.parametrize(

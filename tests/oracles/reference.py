@@ -18,6 +18,7 @@ from tests.oracles.reference_expressions import Context, elements_of, meaning_of
 from tests.oracles.reference_kinds import (
     MAPPING_ERROR,
     NS,
+    TIMES,
     Computation,
     EnumNumber,
     Nanoseconds,
@@ -182,9 +183,14 @@ def _most_elements(target: List) -> int:
 
 
 def _to_message(value: Any, target: MessageType) -> dict[str, Value]:
-    if isinstance(value, Nanoseconds) and target.name in ("builtin_interfaces/msg/Time", "google.protobuf.Timestamp"):
+    if isinstance(value, View) and (value.type.name, target.name) in _SAME_TIMES:
+        return _to_message(_nanoseconds(value), target)
+    if isinstance(value, Nanoseconds) and target.name in (*TIMES, *dict(_SAME_TIMES)):
         sec, nanosec = target.fields
-        return {sec.name: converted(value // NS, sec.type), nanosec.name: converted(value % NS, nanosec.type)}
+        seconds = value // NS
+        if target.name == "google.protobuf.Duration" and seconds < 0:
+            seconds = -(-value // NS)  # nanoseconds have the sign of the seconds
+        return {sec.name: converted(seconds, sec.type), nanosec.name: converted(value - seconds * NS, nanosec.type)}
     if not isinstance(value, View):
         (only,) = target.fields
         return {only.name: converted(value, only.type)}
@@ -193,6 +199,21 @@ def _to_message(value: Any, target: MessageType) -> dict[str, Value]:
         for field in target.fields
         if value.type.field(field.name)
     }
+
+
+_SAME_TIMES = (
+    ("google.protobuf.Timestamp", "builtin_interfaces/msg/Time"),
+    ("google.protobuf.Duration", "builtin_interfaces/msg/Duration"),
+)
+
+
+def _nanoseconds(moment: View) -> Nanoseconds:
+    """A Timestamp or Duration of protobuf. Raises Refused if ROS cannot hold its seconds, or it has too many nanos."""
+    seconds, nanos = moment.read("seconds"), moment.read("nanos")
+    least = 0 if moment.type.name == "google.protobuf.Timestamp" else 1 - NS
+    if not -(1 << 31) <= seconds < 1 << 31 or not least <= nanos < NS:
+        raise Refused(MAPPING_ERROR)
+    return Nanoseconds(seconds * NS + nanos)
 
 
 def _to_float(value: float, target: Float) -> float:

@@ -17,7 +17,12 @@ TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/D
 """ROS messages that are one value in expressions: a time or a duration, in nanoseconds."""
 
 STAMP_TYPES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
-"""Messages that a time can fill: whole seconds, and nanoseconds that are never negative."""
+"""Points in time: whole seconds, and nanoseconds that are never negative."""
+
+PROTOBUF_DURATION = "google.protobuf.Duration"
+"""A duration whose nanoseconds have the sign of its seconds; in ROS they are never negative."""
+
+DURATION_TYPES = frozenset({"builtin_interfaces/msg/Duration", PROTOBUF_DURATION})
 
 
 @dataclass(frozen=True, slots=True)
