@@ -25,9 +25,9 @@ CHANGE_REFRESH = 0.1
 CHANGES_SHOWN = 3
 
 
-_DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards
-obey commands, halt when a deadman stops them, and stop after a second without commands. The endpoints' addresses must
-belong to this computer, as in routes/sim.yaml."""
+_DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Lists have
+as many elements as the table's mappings need. Boards obey commands, halt when a deadman stops them, and stop after a
+second without commands. The endpoints' addresses must belong to this computer, as in routes/sim.yaml."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",
@@ -69,15 +69,23 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from router.datagrams import Wire
+    from router.tools.lengths import needed_lengths
     from router.tools.sim_view import SimView
     from router.tools.simulator import Simulator, parse_obedience, parse_silence
 
     silences = [parse_silence(text) for text in args.silent]
     obeys = parse_obedience(args.obey)
-    _, program = good_table(table_path(args))
+    checked, program = good_table(table_path(args))
     wire = Wire(program.envelope)
     simulator = Simulator(
-        wire, program.table, args.seed, args.speed, deadmen=program.deadmen, silences=silences, obeys=obeys
+        wire,
+        program.table,
+        args.seed,
+        args.speed,
+        deadmen=program.deadmen,
+        silences=silences,
+        obeys=obeys,
+        lengths=needed_lengths(checked.routes),
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: simulator.stop())

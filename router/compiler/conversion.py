@@ -82,7 +82,7 @@ def _to_message(value: tree.Node, target: MessageType, scope: Scope) -> Plan:
     if len(target.fields) == 1:
         (only,) = target.fields
         return Record(target, ((only, convert(value, only.type, scope)),), value.span)
-    if isinstance(value.kind, (IntKind, FloatKind)) and target.name in STAMP_TYPES:
+    if isinstance(value.kind, (IntKind, FloatKind)) and target.name in STAMP_TYPES | DURATION_TYPES:
         raise mismatch(value, target, "convert it with time_from_seconds(x) or time_from_milliseconds(x)")
     raise mismatch(value, target, "map its fields one by one")
 
@@ -117,7 +117,8 @@ def _signed_parts(value: tree.Node) -> tuple[tree.Binary, tree.Binary]:
     raised = _with_number(INT64, value, tree.Operator.ADD, NS_PER_SECOND - 1)
     seconds, _ = _parts(tree.Choice(INT64, span, is_negative, raised, value))
     whole = _with_number(INT64, seconds, tree.Operator.MULTIPLY, NS_PER_SECOND)
-    return seconds, tree.Binary(IntKind(1 - NS_PER_SECOND, NS_PER_SECOND - 1), span, tree.Operator.SUBTRACT, value, whole)
+    rest = IntKind(1 - NS_PER_SECOND, NS_PER_SECOND - 1)
+    return seconds, tree.Binary(rest, span, tree.Operator.SUBTRACT, value, whole)
 
 
 def _with_number(kind: IntKind, left: tree.Node, operator: tree.Operator, right: int) -> tree.Binary:

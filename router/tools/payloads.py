@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -180,10 +181,13 @@ HEALTHY = ("OPERATING", "_OK", "NO_ERROR")
 
 
 class PayloadModel:
-    """The values of one payload case over time. The same seed and times give the same messages."""
+    """The values of one payload case over time. The same seed and times give the same messages.
 
-    def __init__(self, name: str, kind: MessageType, seed: int) -> None:
-        self._name, self._kind, self._seed = name, kind, seed
+    `lengths` are those of lists and bytes by their paths (`lengths.needed_lengths`); the others are short.
+    """
+
+    def __init__(self, name: str, kind: MessageType, seed: int, lengths: Mapping[str, int] | None = None) -> None:
+        self._name, self._kind, self._seed, self._lengths = name, kind, seed, lengths or {}
         self._random = random.Random(f"{seed}/{name}")
         self._phases: dict[str, float] = {}
 
@@ -209,11 +213,12 @@ class PayloadModel:
         elif not isinstance(field.type, List):
             setattr(message, field.name, self._value(field.type, now, path))
         elif isinstance(field.type.element, MessageType):
-            for index in range(_length(field.type) if depth else 0):
+            for index in range(self._length(field.type, path) if depth else 0):
                 self._fill(member.add(), field.type.element, now, f"{path}[{index}]", depth - 1)
         else:
             element = field.type.element
-            member.extend(self._value(element, now, f"{path}[{index}]") for index in range(_length(field.type)))
+            length = self._length(field.type, path)
+            member.extend(self._value(element, now, f"{path}[{index}]") for index in range(length))
 
     def _value(self, kind: Type, now: Pose, path: str) -> object:
         """Return a value of a scalar type: waves of half a minute, each path with a phase of its own."""
@@ -229,7 +234,14 @@ class PayloadModel:
         if isinstance(kind, Enum):
             return _enum_value(kind, wave)
         text = f"{self._name} {now.t:.1f}"[: kind.bound if isinstance(kind, (String, Bytes)) else None]
-        return text if isinstance(kind, String) else text.encode()
+        return text if isinstance(kind, String) else self._octets(text, path)
+
+    def _octets(self, text: str, path: str) -> bytes:
+        length = self._lengths.get(_without_indexes(path), len(text))
+        return text.encode()[:length].ljust(length, b"\0")
+
+    def _length(self, kind: List, path: str) -> int:
+        return self._lengths.get(_without_indexes(path), _usual_length(kind))
 
     def _phase(self, path: str) -> float:
         if path not in self._phases:
@@ -240,8 +252,12 @@ class PayloadModel:
         return self._random.gauss(0.0, deviation)
 
 
-def _length(kind: List) -> int:
+def _usual_length(kind: List) -> int:
     return kind.length if kind.length is not None else min(3, 3 if kind.bound is None else kind.bound)
+
+
+def _without_indexes(path: str) -> str:
+    return re.sub(r"\[\d+\]", "", path)
 
 
 def _enum_value(kind: Enum, wave: float) -> int:

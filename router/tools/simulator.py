@@ -148,7 +148,8 @@ class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
     Raises UsageError if one cannot be bound, and for a table without listeners. `deadmen` are those of the compiled
-    program; boards halt on what they send. Boards in `obeys` obey these payload cases only.
+    program; boards halt on what they send. Boards in `obeys` obey these payload cases only. `lengths` are those of
+    lists that mappings need (`lengths.needed_lengths`).
     """
 
     def __init__(
@@ -161,6 +162,7 @@ class Simulator:
         deadmen: Sequence[DeadmanPlan] = (),
         silences: Sequence[Silence] = (),
         obeys: Mapping[str, Collection[str]] | None = None,
+        lengths: Mapping[str, int] | None = None,
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
@@ -171,7 +173,7 @@ class Simulator:
         self._streams = tuple(streams(wire, table, seed, speed))
         self._silences = silences
         check_silences(silences, self._streams)
-        self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
+        self._models = [PayloadModel(stream.case.name, stream.case.type, seed, lengths) for stream in self._streams]
         # Endpoints without a `listener` send to the first one.
         self._router = listener_address(next(iter(table.listeners.values())))
         self._destinations = {

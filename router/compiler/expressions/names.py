@@ -12,7 +12,6 @@ from router.compiler.expressions.kinds import (
     BoolKind,
     EnumKind,
     FloatKind,
-    Kind,
     ListKind,
     MessageKind,
     StringKind,
