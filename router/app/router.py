@@ -28,7 +28,6 @@ from router.net.udp import Listener
 from router.observe.obedience import Obedience, Replies
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
-from router.observe.silences import Silences
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, StopStack, background_threads
@@ -85,7 +84,7 @@ class Router:
         self._reloader = Reloader(self._runtime, environ, self._replaced, keeper)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
-        self._silences = Silences()
+        self._known: Mapping[str, int] = dict.fromkeys(program.table.endpoints, boottime_ns())
         self._collector: tuple[Program, CountersCollector] | None = None
         self._open = StopStack()
 
@@ -266,8 +265,9 @@ class Router:
             "start": self._start,
         }
         # Use this program's counters: those of the running program are adopted only once no thread is stuck.
-        copies = partial(self._counts.copies, program.counters.size)
-        return CountersCollector(program.counters, copies, self._computed_series(), self._silences, build)
+        copies, now = partial(self._counts.copies, program.counters.size), boottime_ns()
+        self._known = {name: self._known.get(name, now) for name in program.table.endpoints}
+        return CountersCollector(program.counters, copies, self._computed_series(), self._known, build)
 
 
 class Services:

@@ -168,7 +168,7 @@ def datagrams_of(datagrams: Collection[bytes]) -> ctypes.Array[c.DeadmanDatagram
 
 def _heard(name: str, counters: Counters) -> Mapping[str, int]:
     """Return the fields of a destination that say when it was last heard."""
-    return {"is_heard": 1, "last_seen": counters.index("endpoint_last_seen_timestamp_seconds", name)}
+    return {"is_heard": 1, "last_seen": counters.index("endpoint_silence_seconds", name)}
 
 
 def _obeyed(plan: DeadmanPlan, name: str, counters: Counters) -> Mapping[str, int]:

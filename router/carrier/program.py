@@ -178,7 +178,7 @@ class _Writer:
         destinations = [target for target in plan.targets if not target.is_topic]
         made = c.Route(
             sends=of_datagrams(plan, destinations, lowered.to_destinations.get(plan.route)),
-            last_message=self.counters.index("route_last_message_timestamp_seconds", plan.route),
+            last_message=self.counters.index("route_silence_seconds", plan.route),
             duration=self.counters.index("route_duration_seconds", plan.route),
         )
         if topics:

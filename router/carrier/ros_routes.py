@@ -87,7 +87,7 @@ def _route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRou
         seconds=seconds,
         nanoseconds=nanoseconds,
         received=counters.index("messages_received", plan.route, plan.topic),
-        last_message=counters.index("route_last_message_timestamp_seconds", plan.route),
+        last_message=counters.index("route_silence_seconds", plan.route),
         duration=counters.index("route_duration_seconds", plan.route),
     )
 

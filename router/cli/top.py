@@ -114,7 +114,7 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            seen = view(*window.ends, problems, time.time())
+            seen = view(*window.ends, problems)
             shown = Screen(seen, f"router top {url}", order, console.height, note, first)
             live.update(shown, refresh=True)
             try:

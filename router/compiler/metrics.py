@@ -15,10 +15,12 @@ from router.declared import HISTOGRAM_BOUNDS
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric. `kind` is counter, histogram, number, level, or time (nanoseconds in the counters, seconds exported).
+    """One metric. `kind` is counter, histogram, number, level, time (nanoseconds in the counters, seconds exported), or
+    age: the boot clock (ns) at an event in the counters, the seconds since then exported, no series before it.
 
-    One thread sets a number or a time; several add to a level and subtract from it. A metric that `tells_commands` is
-    also exported with the label COMMAND, which follows from its `route` and `target`. `bounds` (ns) are a histogram's.
+    One thread sets a number, a time or an age; several add to a level and subtract from it. A metric that
+    `tells_commands` is also exported with the label COMMAND, which follows from its `route` and `target`. `bounds` (ns)
+    are a histogram's.
     """
 
     name: str
@@ -90,22 +92,26 @@ METRICS = (
         "Time from receipt of a message until it is forwarded, and delivered or queued for all other targets.",
         bounds=LATENCY_BOUNDS_NS,
     ),
-    Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last accepted a message."),
-    Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
     Metric(
-        "endpoint_heard_since_timestamp_seconds",
-        "time",
+        "route_silence_seconds",
+        "age",
+        ("route",),
+        "How long ago the route last accepted a message; no series until it has accepted one.",
+    ),
+    Metric(
+        "endpoint_silence_seconds",
+        "age",
         ("endpoint",),
-        "Since when the endpoint has been heard without a silence.",
+        "How long ago the endpoint last sent; no series until it has sent.",
+    ),
+    Metric(
+        "endpoint_heard_seconds",
+        "age",
+        ("endpoint",),
+        "How long ago the endpoint was first heard since its last silence; no series until it has sent.",
     ),
     Metric("endpoint_silences", "counter", ("endpoint",), "How often the endpoint was heard again after a silence."),
     Metric("endpoint_last_silence_seconds", "time", ("endpoint",), "How long the last such silence was."),
-    Metric(
-        "endpoint_silence_seconds",
-        "number",
-        ("endpoint",),
-        "How long ago the endpoint last sent, by a clock that nobody sets; no series until it has sent.",
-    ),
     Metric(
         "endpoint_unheard_seconds",
         "number",
@@ -187,8 +193,8 @@ METRICS = (
 )
 
 ENDPOINT_METRICS = (
-    "endpoint_last_seen_timestamp_seconds",
-    "endpoint_heard_since_timestamp_seconds",
+    "endpoint_silence_seconds",
+    "endpoint_heard_seconds",
     "endpoint_silences",
     "endpoint_last_silence_seconds",
 )

@@ -83,7 +83,7 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
 def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
     """Open the series of a route, or of one source topic of a route from ROS."""
     route = plan.route
-    _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route)
+    _open(counters, ("route_duration_seconds", "route_silence_seconds"), route)
     published = [target.label for target in plan.targets if target.is_topic]
     for topic in published if plan.topic is None else [plan.topic]:
         _open_each(counters, "qos_incompatible", route, topic, last=QOS_POLICIES)
@@ -113,7 +113,7 @@ def _open_deadman(counters: Counters, plan: DeadmanPlan) -> None:
 def _open_gateway(counters: Counters, plan: GatewayPlan) -> None:
     name = plan.settings.name
     _open(counters, ("datagrams_received", "received_bytes", "gateway_clients", "gateway_client_clock_ahead"), name)
-    _open(counters, ("route_last_message_timestamp_seconds",), name)
+    _open(counters, ("route_silence_seconds",), name)
     _open_each(counters, "datagrams_rejected", name, last=GATEWAY_REJECT_REASONS)
     _open_each(counters, "messages_received", name, last=(ROS, CLIENTS))
     _open(counters, ("messages_sent", "messages_filtered"), name, CLIENTS)

@@ -11,7 +11,7 @@ from router.table.model import ROS, Gateway
 class GatewayCounters:
     """Counts each ROS message once as sent, filtered or dropped.
 
-    Use it only in the thread that owns `counts`. `wall_ns` is the wall clock.
+    Use it only in the thread that owns `counts`. `clock_ns` is the boot clock.
     """
 
     def __init__(
@@ -20,15 +20,15 @@ class GatewayCounters:
         counters: Counters,
         counts: list[int],
         report: Callable[[Report], None],
-        wall_ns: Callable[[], int],
+        clock_ns: Callable[[], int],
     ) -> None:
         name, transport = settings.name, settings.transport.value.value
         self._name = name
         self._counts = counts
         self._report = report
-        self._wall_ns = wall_ns
+        self._clock_ns = clock_ns
         self._received = counters.index("messages_received", name, ROS)
-        self._last = counters.index("route_last_message_timestamp_seconds", name)
+        self._last = counters.index("route_silence_seconds", name)
         self._sent = counters.index("messages_sent", name, CLIENTS)
         self._filtered = counters.index("messages_filtered", name, CLIENTS)
         self._dropped = {
@@ -49,7 +49,7 @@ class GatewayCounters:
         """Count messages from ROS."""
         if messages:
             self._counts[self._received] += messages
-            self._counts[self._last] = self._wall_ns()
+            self._counts[self._last] = self._clock_ns()
 
     def sent(self) -> None:
         """Count a ROS message that was sent to all clients."""

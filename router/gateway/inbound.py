@@ -84,7 +84,7 @@ class InboundPublisher:
         self._freshness = Freshness(outputs.library)
         self.log = FloodLog()
         self._accepted = counters.index("messages_received", name, CLIENTS)
-        self._last = counters.index("route_last_message_timestamp_seconds", name)
+        self._last = counters.index("route_silence_seconds", name)
         self._clock_ahead = counters.index("gateway_client_clock_ahead", name)
         self._rejected = {
             reason: counters.index("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS
@@ -145,8 +145,7 @@ class InboundPublisher:
     def _publish(self, topic: _Topic, cdr: bytes, sent: float | None, arrived_ns: int) -> None:
         """Publish a message. `sent` is the client's wall clock in seconds."""
         self._counts[self._accepted] += 1
-        self._counts[self._last] = self._outputs.wall_ns()
-        now = self._outputs.clock_ns()
+        now = self._counts[self._last] = self._outputs.clock_ns()
         if topic.ttl is not None and sent is not None:
             self._check_age(topic, topic.ttl, sent, arrived_ns, now)
         if topic.may_pass and not topic.may_pass(now):

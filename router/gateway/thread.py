@@ -172,7 +172,7 @@ class GatewayThread:
     async def _open(self, plan: GatewayPlan, program: Program, outputs: InboundOutputs) -> GatewayService:
         settings, counters = plan.settings, program.counters
         http = program.table.http.value if program.table.http else None  # fixed while the router runs
-        gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, wall_ns)
+        gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, boottime_ns)
         inbound = InboundPublisher(plan, ENCODINGS[settings.format](settings), counters, self._counts, outputs)
         service = GatewayService(
             plan, self._context, gateway_counters, inbound, lambda events: self._transport(settings, http, events)

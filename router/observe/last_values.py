@@ -12,6 +12,7 @@ from typing import Any
 
 from google.protobuf.json_format import MessageToDict
 
+from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, first_field
@@ -31,7 +32,9 @@ class LastValues:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._newest: dict[int, Mirrored] = {}  # by the number of the first field
+        self._newest: dict[
+            int, tuple[int, Mirrored]
+        ] = {}  # by the number of the first field; and when (boot clock, ns)
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
@@ -40,7 +43,7 @@ class LastValues:
         self._closing = threading.Event()
 
     def of(self, program: Program) -> Mapping[str, Value]:
-        """Return `at` (s), `source`, `bytes` and `fields` by payload case. The first request returns nothing."""
+        """Return `at` (boot clock, s), `source`, `bytes` and `fields` by payload case; nothing at the first request."""
         with self._lock:
             self._until = monotonic() + LOOKED_AT_SECONDS
             if self._detach is None and not self._closing.is_set():
@@ -54,8 +57,8 @@ class LastValues:
             with self._newest_lock:
                 newest, self._newest = self._newest, {}
             classifier = Classifier(program.envelope, program.table)
-            for datagram in newest.values():
-                self._decode(datagram, classifier)
+            for at, datagram in newest.values():
+                self._decode(at, datagram, classifier)
             return dict(self._values)
 
     def close(self) -> None:
@@ -65,14 +68,15 @@ class LastValues:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Remember the newest datagrams. Called by the mirror's thread."""
+        now = boottime_ns()
         with self._newest_lock:
             for datagram in batch:
                 *_, reason, data = datagram
                 if not reason:
-                    self._newest[first_field(data)] = datagram
+                    self._newest[first_field(data)] = now, datagram
 
-    def _decode(self, datagram: Mirrored, classifier: Classifier) -> None:
-        at, listener, peer, endpoint, _, data = datagram
+    def _decode(self, at: int, datagram: Mirrored, classifier: Classifier) -> None:
+        _, listener, peer, endpoint, _, data = datagram
         if (found := classifier.payload(listener, data)) is None:
             return  # a reload has changed the messages meanwhile
         case, payload = found

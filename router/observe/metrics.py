@@ -11,19 +11,15 @@ from prometheus_client.metrics_core import Metric as Family
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 
+from router.clock import boottime_ns
 from router.compiler.metrics import COMMAND, HISTOGRAM_CELLS, METRICS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
-from router.observe.silences import Silences
 from router.observe.snapshot import BUCKETS, PREFIX
 
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
-_EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
-
-_LAST_SEEN = "endpoint_last_seen_timestamp_seconds"
-_SILENCES = {"endpoint_silence_seconds": True, "endpoint_unheard_seconds": False}
-"""Metrics of silences: whether they are of endpoints that were heard."""
+_EXPORTED_AS = {"time": "gauge", "age": "gauge", "number": "gauge", "level": "gauge"}
 
 SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]
 """Returns the label values, in the metric's order, and the value of each current series."""
@@ -32,9 +28,9 @@ SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]
 class CountersCollector(Collector):
     """Exports all series of the counters from the first scrape on, even at 0.
 
-    `counts()` copies the list of each counting thread: a counter or level is their sum, a number or time their maximum.
-    `computed` has, by metric, functions that are called at each scrape instead; `silences` measures those of endpoints.
-    `build`: labels of `router_build_info`.
+    `counts()` copies the list of each counting thread: a counter or level is their sum, everything else their maximum.
+    `computed` has, by metric, functions that are called at each scrape instead. `known`: since when the table has each
+    endpoint (boot clock, ns). `build`: labels of `router_build_info`.
     """
 
     def __init__(
@@ -42,12 +38,14 @@ class CountersCollector(Collector):
         counters: Counters,
         counts: Callable[[], Sequence[Sequence[int]]],
         computed: Mapping[str, SeriesFunction],
-        silences: Silences,
+        known: Mapping[str, int],
         build: Mapping[str, str],
+        clock_ns: Callable[[], int] = boottime_ns,
     ) -> None:
         self._counts = counts
         self._computed = computed
-        self._silences = silences
+        self._known = known
+        self._clock_ns = clock_ns
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
@@ -58,40 +56,41 @@ class CountersCollector(Collector):
             self._indexes[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:
-        threads = self._counts()
+        threads, now = self._counts(), self._clock_ns()
         for metric in METRICS:
             family = Family(PREFIX + metric.name, metric.help, _EXPORTED_AS.get(metric.kind, metric.kind))
-            family.samples = _with_rests(self._samples(metric, threads))  # type: ignore[assignment]  # read once, in order
+            family.samples = _with_rests(self._samples(metric, threads, now))  # type: ignore[assignment]  # read once, in order
             yield family
         yield self._build
 
-    def _samples(self, metric: Metric, threads: Sequence[Sequence[int]]) -> Iterator[Sample]:
+    def _samples(self, metric: Metric, threads: Sequence[Sequence[int]], now: int) -> Iterator[Sample]:
         name = PREFIX + metric.name
         suffix = "_total" if metric.kind == "counter" else ""
         if metric.name in self._computed:
             for values, value in self._computed[metric.name]():
                 yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
-            return
-        if metric.name in _SILENCES:
-            yield from self._silent(name, threads, were_heard=_SILENCES[metric.name])
-            return
-        for labels, index in self._indexes[metric.name]:
-            if metric.kind == "histogram":
+        elif metric.name == "endpoint_unheard_seconds":
+            for labels, index in self._indexes["endpoint_silence_seconds"]:
+                if not any(thread[index] for thread in threads):
+                    yield Sample(name, labels, (now - self._known[labels["endpoint"]]) / 1e9)
+        elif metric.kind == "histogram":
+            for labels, index in self._indexes[metric.name]:
                 cells = [thread[index : index + HISTOGRAM_CELLS] for thread in threads]
                 yield from _histogram(name, labels, metric.bounds, cells)
-            elif metric.kind == "time":
-                yield Sample(name, labels, max(thread[index] for thread in threads) / 1e9)
-            elif metric.kind == "number":
-                yield Sample(name, labels, max(thread[index] for thread in threads))
-            else:
-                yield Sample(name + suffix, labels, sum(thread[index] for thread in threads))
+        else:
+            for labels, index in self._indexes[metric.name]:
+                if (value := _value(metric.kind, [thread[index] for thread in threads], now)) is not None:
+                    yield Sample(name + suffix, labels, value)
 
-    def _silent(self, name: str, threads: Sequence[Sequence[int]], *, were_heard: bool) -> Iterator[Sample]:
-        indexes = {labels["endpoint"]: index for labels, index in self._indexes[_LAST_SEEN]}
-        stamps = {endpoint: max(thread[index] for thread in threads) for endpoint, index in indexes.items()}
-        for endpoint, seconds in self._silences.of(stamps).items():
-            if bool(stamps[endpoint]) is were_heard:
-                yield Sample(name, {"endpoint": endpoint}, seconds)
+
+def _value(kind: str, counts: Sequence[int], now: int) -> float | None:
+    """Return the value of a series that is no histogram, or None if it does not exist yet."""
+    if kind in ("counter", "level"):
+        return sum(counts)
+    latest = max(counts)
+    if kind == "age":
+        return max(now - latest, 0) / 1e9 if latest else None
+    return latest / 1e9 if kind == "time" else latest
 
 
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:

@@ -18,7 +18,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
 from router.assets import page_policy
-from router.clock import wall_ns
+from router.clock import boottime_ns
 from router.errors import RouterError
 from router.observe.problems import Kind
 from router.observe.running import Running
@@ -130,7 +130,7 @@ class Responder:
 
     def _collected(self, accepted: str) -> Response:
         encode, kind = choose_encoder(accepted)
-        at = f"{wall_ns() / 1e9:.6f}"
+        at = f"{boottime_ns() / 1e9:.6f}"
         return Response(HTTPStatus.OK, kind, encode(self._registry), {COLLECTED_AT: at})
 
     def _numbers(self) -> Response:

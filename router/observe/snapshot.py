@@ -16,7 +16,7 @@ PREFIX = "router_"
 """The prefix of exported names."""
 
 COLLECTED_AT = "X-Collected-At"
-"""A header of /metrics: when they were collected, in seconds of the router's wall clock."""
+"""A header of /metrics: when they were collected, in seconds of the router's boot clock."""
 
 BUCKETS = "_bucket"
 """The suffix of a histogram's name. Its values are cumulative, as in Prometheus: the number at or below `le`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from router.clock import boottime_ns, wall_ns
+from router.clock import boottime_ns
 from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
 from router.observe.last_values import LastValues
@@ -25,7 +25,7 @@ PATHS = {
     "messages_dropped": "routes {route} targets {target} dropped {reason}",
     "messages_filtered": "routes {route} targets {target} filtered",
     "messages_collected": "routes {route} targets {target} collected",
-    "route_last_message_timestamp_seconds": "routes {route} last",
+    "route_silence_seconds": "routes {route} silence",
     "deadman_trips": "routes {route} deadman_trips",
     "deadman_datagrams_sent": "routes {route} deadman_sent {destination}",
     "gateway_clients": "routes {route} clients",
@@ -58,13 +58,13 @@ IF_ANY = {
 
 
 class Status:
-    """Makes the JSON. Thread-safe. Times are wall-clock seconds. `can_save`: whether the last datagrams are kept."""
+    """Makes the JSON. Thread-safe. Times: boot clock, s. `can_save`: whether the last datagrams are kept."""
 
     def __init__(self, running: Running, health: Health, can_save: bool = False) -> None:
         self._running = running
         self._health = health
         self._can_save = can_save
-        self._started = wall_ns() / 1e9
+        self._started = boottime_ns() / 1e9
         self._values = LastValues(running)
 
     def numbers(self) -> Json:
@@ -74,22 +74,21 @@ class Status:
         """
         running = self._running
         program = running.program
-        table = program.table
+        table, at = program.table, boottime_ns() / 1e9
         return {
-            "at": wall_ns() / 1e9,
+            "at": at,
             "started": self._started,
             "map": table.sha256,
             "table": table.path.name,
             "ready": running.is_ready,
-            **numbers(snapshot(running.collect(), wall_ns() / 1e9)),
+            **numbers(snapshot(running.collect(), at)),
             "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }
 
     def recent(self) -> Json:
         """Return the numbers of the last seconds, oldest first, without latencies: a new page has rates at once."""
-        booted = (wall_ns() - boottime_ns()) / 1e9  # snapshots of a look have the boot clock
-        return {"numbers": [{"at": booted + each.at, **numbers(each)} for each in self._health.look().snapshots]}
+        return {"numbers": [{"at": each.at, **numbers(each)} for each in self._health.look().snapshots]}
 
     def health(self) -> Json:
         """Return all problems. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""

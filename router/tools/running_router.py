@@ -74,7 +74,7 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
 
 
 def metrics(url: str) -> Snapshot:
-    """Return the metrics of a running router, and when they were read (`at`: s, wall clock).
+    """Return the metrics of a running router, and when they were read (`at`: s, boot clock).
 
     Raises TransportError if nothing answers, or something other than a router.
     """
@@ -82,7 +82,7 @@ def metrics(url: str) -> Snapshot:
 
     text, headers = _got(url, "/metrics")
     try:
-        at = float(headers.get(COLLECTED_AT) or time.time())
+        at = float(headers.get(COLLECTED_AT) or time.monotonic())
         found = parse_metrics(text.decode(errors="replace"), at)
     except (ValueError, KeyError) as error:
         raise TransportError(f"what answers at {url}/metrics is not a router") from error

@@ -139,12 +139,8 @@ def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
     )
 
 
-def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), now: float | None = None) -> View:
-    """Return totals as of `after`, rates per second and latencies since `before`, routes in the order of the metrics.
-
-    `now` is the time for ages, in seconds since 1970; by default that of `after`.
-    """
-    now = after.at if now is None else now
+def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = ()) -> View:
+    """Return totals and ages as of `after`, rates per second and latencies since `before`, routes as in the metrics."""
     routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
     rejected: dict[str, int] = defaultdict(int)
     for (_, reason), count in after.counts("datagrams_rejected").items():
@@ -154,7 +150,7 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), no
     unheard = [endpoint for (endpoint,) in after.counts(Kind.ENDPOINT_NEVER_HEARD.metric)]
     silence: dict[str, float | None] = {**heard, **dict.fromkeys(unheard)}
     return View(
-        routes=tuple(_route_row(route, before, after, problems, now) for route in routes),
+        routes=tuple(_route_row(route, before, after, problems) for route in routes),
         received=after.total("datagrams_received"),
         rate=_rate(before, after, "datagrams_received"),
         rejected=dict(rejected),
@@ -195,7 +191,7 @@ def _has(problems: Sequence[Problem], kind: Kind, route: str = "", **labels: str
     )
 
 
-def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence[Problem], now: float) -> RouteRow:
+def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence[Problem]) -> RouteRow:
     latencies = _new_latencies(_latencies(route, before), _latencies(route, after))
     return RouteRow(
         route=route,
@@ -204,7 +200,7 @@ def _route_row(route: str, before: Snapshot, after: Snapshot, problems: Sequence
         targets=tuple(
             _target_row(metric, route, target, before, after, problems) for metric, target in _targets(route, after)
         ),
-        age=_age(after.of("route_last_message_timestamp_seconds", route).get((), 0.0), now),
+        age=after.of("route_silence_seconds", route).get(()),
         median=quantile(latencies, 0.5),
         slowest=quantile(latencies, 0.99),
         is_tripped=_has(problems, Kind.DEADMAN_ACTIVE, route),
@@ -243,10 +239,6 @@ def _rate(before: Snapshot, after: Snapshot, metric: str, *labels: str) -> float
     """Return the increase per second; a restarted router counts from zero."""
     then, now, seconds = before.total(metric, *labels), after.total(metric, *labels), after.at - before.at
     return (now - then if now >= then else now) / seconds if seconds > 0 else 0.0
-
-
-def _age(stamp: float, now: float) -> float | None:
-    return max(now - stamp, 0.0) if stamp else None
 
 
 def _latencies(route: str, snapshot: Snapshot) -> dict[float, float]:

@@ -154,7 +154,7 @@ class NativeSide:
         self._seams.seam_refuse(self._outlets[endpoint].address, errno.ECONNREFUSED)
 
     def hears(self, endpoint: str) -> None:
-        self._heard[self._counters.index("endpoint_last_seen_timestamp_seconds", endpoint)] += 1
+        self._heard[self._counters.index("endpoint_silence_seconds", endpoint)] += 1
 
     def await_subscribers(self, deadman: NativeDeadman, now: int) -> None:
         self._library.deadman_await_subscribers(self.deadmen.address, deadman.address, now)

@@ -56,7 +56,7 @@ def test_a_board_that_is_reset_leaves_a_trace(heard: Heard) -> None:
     assert heard.returned == [Returned("sensor_board", 2.3), Returned("sensor_board", 2.6)]
     assert heard.count("endpoint_silences") == 2
     assert heard.count("endpoint_last_silence_seconds") == 2600 * MS
-    assert heard.count("endpoint_last_seen_timestamp_seconds") == heard.count("endpoint_heard_since_timestamp_seconds")
+    assert heard.count("endpoint_silence_seconds") == heard.count("endpoint_heard_seconds") == heard.stage.now
 
 
 def test_short_pauses_and_slow_senders_have_no_silences(heard: Heard) -> None:
@@ -82,6 +82,7 @@ def test_a_clock_that_is_set_is_no_silence(heard: Heard) -> None:
     for ahead in (3600 * SECOND, 0, -3600 * SECOND):
         heard.set_clock(ahead)
         heard.hear(20, 300)
+        assert heard.count("endpoint_silence_seconds") == heard.stage.now
     assert heard.returned == []
     heard.hear(2300)
     assert heard.returned == [Returned("sensor_board", 2.3)]

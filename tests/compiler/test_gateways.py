@@ -298,7 +298,7 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
         ("gateway_client_clock_ahead", "it"),
         *(("gateway_topics", "it", state) for state in TOPIC_STATES),
         *(("client_messages_dropped", "it", reason) for reason in CLIENT_DROP_REASONS),
-        ("route_last_message_timestamp_seconds", "it"),
+        ("route_silence_seconds", "it"),
         *(("qos_incompatible", "it", topic, policy) for policy in QOS_POLICIES),
         ("deadman_active", watch),
         ("deadman_trips", watch),

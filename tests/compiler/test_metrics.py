@@ -56,7 +56,7 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
             assert Series(delivered, (route, target.label)) in series
             assert Series("messages_filtered", (route, target.label)) in series
             assert all(Series("messages_dropped", (route, target.label, reason)) in series for reason in DROP_REASONS)
-        for name in ("route_duration_seconds", "route_last_message_timestamp_seconds"):
+        for name in ("route_duration_seconds", "route_silence_seconds"):
             assert Series(name, (route,)) in series
 
 

@@ -175,7 +175,7 @@ def test_a_routes_panels_show_what_it_does(case: str, monitored: Monitored, prom
     for row in ("Routes", "Route $route"):
         for query in filled(row, instance=monitored.address, route=case):
             shown |= {selector.metric: prometheus.query(query) for selector in selectors(query)}
-    [age] = shown["router_route_last_message_timestamp_seconds"]
+    [age] = shown["router_route_silence_seconds"]
     assert 0 <= float(age["value"][1]) < 60
     assert float(shown["router_messages_received_total"][0]["value"][1]) > 0
     assert any(float(bucket["value"][1]) > 0 for bucket in shown["router_route_duration_seconds_bucket"])

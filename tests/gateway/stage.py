@@ -184,7 +184,7 @@ class Stage:
         return self.counts[self._counters.index(metric, *labels)]
 
     def gateway_counters(self, plan: GatewayPlan) -> GatewayCounters:
-        return GatewayCounters(plan.settings, self._counters, self.counts, self.reports.append, wall_ns)
+        return GatewayCounters(plan.settings, self._counters, self.counts, self.reports.append, boottime_ns)
 
     def inbound(self, plan: GatewayPlan) -> InboundPublisher:
         def publisher(topic: str) -> Any:

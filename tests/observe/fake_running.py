@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,6 @@ from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.obedience import Reply
 from router.observe.running import ReloadResult
-from router.observe.silences import Silences
 from router.observe.watch import Health, Watch
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.table.addresses import Address
@@ -41,19 +40,11 @@ def sim_program() -> Program:
     return program
 
 
-class FullSilences(Silences):
-    """Endpoints are silent since their last datagram, however long ago this began to look."""
-
-    def __init__(self, began: int | None = None) -> None:
-        super().__init__()
-        self._began = began or wall_ns()
-
-    def of(self, stamps: Mapping[str, int]) -> Mapping[str, float]:
-        return {endpoint: (wall_ns() - (stamp or self._began)) / 1e9 for endpoint, stamp in stamps.items()}
-
-
 class FakeRunning:
-    """`failures` has exceptions of the mirror's consumers, `collected` counts reads of the counters."""
+    """`failures` has exceptions of the mirror's consumers, `collected` counts reads of the counters.
+
+    `began`: when it was started (boot clock, ns).
+    """
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -69,7 +60,7 @@ class FakeRunning:
         self.waiting: deque[Mirrored] = deque()
         self.acted: deque[Acted] = deque()
         self.counts = program.counters.fresh_counts()
-        self.silences: Silences = FullSilences()
+        self.began = boottime_ns()
         self._turns = 0
 
     def observe(self, *, is_observed: bool) -> None:
@@ -99,8 +90,12 @@ class FakeRunning:
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         } | {"endpoint_stale_after_seconds": self._stale_after}
-        counters = self.program.counters
-        return CountersCollector(counters, lambda: [self.counts], computed, self.silences, {"version": "1"}).collect()
+        counters, known = self.program.counters, dict.fromkeys(self.program.table.endpoints, self.began)
+        build = {"version": "1"}
+        return CountersCollector(counters, lambda: [self.counts], computed, known, build, self.clock_ns).collect()
+
+    def clock_ns(self) -> int:
+        return boottime_ns()
 
     def _stale_after(self) -> Iterator[tuple[tuple[str, str], float]]:
         for endpoint in self.program.table.endpoints.values():

@@ -16,7 +16,7 @@ from router.observe.obedience import Reply
 from router.observe.problems import PAGE, Kind, Level, Problem
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
-from tests.observe.counting import SECOND, Counting
+from tests.observe.counting import Counting
 
 STALLED = Kind.PUBLISH_STALLED.metric
 SENT = "it was sent manual_brake {brake: true}"
@@ -494,18 +494,6 @@ def test_a_field_that_the_envelope_lacks_is_one_problem_with_number_and_sender(r
     router.seen[Mismatch("rover", "192.168.0.30", "field 77")] = router.now
     [problem] = router.look(1).problems
     assert problem.text == "rover rejects datagrams: unknown_case, 9 in 1 s: sensor_board (192.168.0.30) sends field 77"
-
-
-@pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])
-def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Counting, shift: int) -> None:
-    router.hear("sensor_board")
-    router.look(1)
-    router.shift = shift
-    assert router.told(1) == []
-    assert router.told(1.5) == ["sensor_board is silent: last heard 3.5 s ago"]
-    router.hear("sensor_board")
-    router.look(1)
-    assert router.look(0).silence["sensor_board"] == 1.0
 
 
 def drive(router: Counting, *numbers: int) -> list[Problem]:

@@ -13,13 +13,12 @@ from typing import cast
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from router.clock import wall_ns
+from router.clock import boottime_ns
 from router.compiler.metrics import LATENCY_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import Running
-from router.observe.silences import Silences
 from router.observe.watch import Health
 from router.table.addresses import Address
 
@@ -89,7 +88,7 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     threads = [counters.fresh_counts(), counters.fresh_counts()]
     result = Scraped(indexes, threads, 0, LOOPBACK)
     computed = {"kernel_drops": lambda: [(["rover"], result.drops)]}
-    collector = CountersCollector(counters, lambda: threads, computed, Silences(), BUILD)
+    collector = CountersCollector(counters, lambda: threads, computed, {LABELS["endpoint"]: 0}, BUILD)
     with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), NO_HEALTH, None)) as server:
         result.address = server.address
         yield result
@@ -99,10 +98,10 @@ def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
     values = scraped.values()
     for metric in METRICS:
         labels = frozenset((label, LABELS[label]) for label in metric.exported_labels)
-        suffix = {"counter": "_total", "time": "", "number": "", "level": "", "histogram": "_count"}[metric.kind]
+        suffix = {"counter": "_total", "histogram": "_count"}.get(metric.kind, "")
         if metric.name == "endpoint_unheard_seconds":
             assert values["router_endpoint_unheard_seconds", labels] > 0
-        elif metric.name != "endpoint_silence_seconds":
+        elif metric.kind != "age":
             assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
 
 
@@ -110,22 +109,22 @@ def test_an_endpoint_is_unheard_until_it_is_heard_and_then_silent(scraped: Scrap
     endpoint = frozenset({("endpoint", LABELS["endpoint"])})
     silence, unheard = ("router_endpoint_silence_seconds", endpoint), ("router_endpoint_unheard_seconds", endpoint)
     assert silence not in scraped.values()
-    scraped.threads[0][scraped.indexes["endpoint_last_seen_timestamp_seconds"]] = wall_ns() + 3600 * 10**9
+    scraped.threads[0][scraped.indexes["endpoint_silence_seconds"]] = boottime_ns() - 3 * 10**9
     values = scraped.values()
     assert unheard not in values
-    assert 0 <= values[silence] < 60
+    assert 3 <= values[silence] < 60
 
 
 def test_a_counter_is_the_sum_over_threads_and_a_gauge_the_latest_of_them(scraped: Scraped) -> None:
     first, second = scraped.threads
     first[scraped.indexes["datagrams_sent"]], second[scraped.indexes["datagrams_sent"]] = 3, 4
-    seen = scraped.indexes["endpoint_last_seen_timestamp_seconds"]
-    first[seen], second[seen] = 1_500_000_000, 2_500_000_000
+    loaded = scraped.indexes["config_last_reload_timestamp_seconds"]
+    first[loaded], second[loaded] = 1_500_000_000, 2_500_000_000
     waiting = scraped.indexes["messages_waiting"]
     first[waiting], second[waiting] = 5, -3
     second[scraped.indexes["qos_incompatible"]] = first[scraped.indexes["deadman_active"]] = 2
     assert scraped.value("router_datagrams_sent_total") == 7
-    assert scraped.value("router_endpoint_last_seen_timestamp_seconds") == 2.5
+    assert scraped.value("router_config_last_reload_timestamp_seconds") == 2.5
     assert scraped.value("router_messages_waiting") == 2
     assert scraped.value("router_qos_incompatible") == 2
     assert scraped.value("router_deadman_active") == 2
@@ -163,6 +162,6 @@ def test_the_process_and_what_it_runs_are_described_and_python_is_not(scraped: S
 def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
-        collector = CountersCollector(Counters(), lambda: [[]], {}, Silences(), BUILD)
+        collector = CountersCollector(Counters(), lambda: [[]], {}, {}, BUILD)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: cannot serve HTTP at {taken}: .*\(pid \d+\)"):
             HttpServer(taken, SPAN, cast("Running", collector), NO_HEALTH, None)

@@ -28,7 +28,7 @@ struct route {
     struct targets publishes; /* topics, which the publish thread serves */
     const struct witness *witnesses;
     uint32_t witness_count, reserved;
-    uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
+    uint32_t last_message, duration; /* counters: boot clock; a histogram has HISTOGRAM_BOUNDS + 2 */
 };
 
 /* The route for messages of one sender with one payload case: its index, or -1. */
@@ -50,7 +50,7 @@ struct peer {
     uint32_t address; /* host byte order */
     uint32_t port;    /* 0: any */
     uint32_t column;  /* of the listener's choices */
-    uint32_t last_seen, heard_since, silences, last_silence; /* counters */
+    uint32_t last_seen, heard_since, silences, last_silence; /* counters, the first two of the boot clock */
     uint32_t id;      /* of the endpoint, in mirror records and events */
     uint32_t reserved;
     int64_t pause;    /* ns: a longer one is a silence */

@@ -167,22 +167,21 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
     if (chosen->witness_count) show_to_deadmen(routing, chosen, received);
-    counter_set(routing->stage.counters, chosen->last_message, received->received_at);
+    counter_set(routing->stage.counters, chosen->last_message, received->now);
     return ROUTED;
 }
 
 /* ---- silences ---- */
 
-/* An endpoint is heard again after `silence`. That is its rhythm, not a silence, if it had been heard for less time before.
- * If the clock was set meanwhile, the length is unknown; if it was set back before, so is how long it had been heard. */
-static void end_silence(struct routing *routing, const struct received *received, int64_t before, int64_t silence) {
+/* An endpoint is heard again, last time at `before` (0: never). If it had been heard for less time than it was silent, that
+ * is its rhythm, not a silence. */
+static void end_silence(struct routing *routing, const struct received *received, int64_t before) {
     const struct peer *peer = received->peer;
     counter *counters = routing->stage.counters;
     int64_t heard_since = atomic_load_explicit(&counters[peer->heard_since], memory_order_relaxed);
-    counter_set(counters, peer->heard_since, received->received_at);
-    bool is_known = before && received->now - silence >= routing->freshness.since;
-    bool is_rhythm = before >= heard_since && before - heard_since < silence;
-    if (!is_known || is_rhythm) return;
+    int64_t silence = received->now - before;
+    counter_set(counters, peer->heard_since, received->now);
+    if (!before || before - heard_since < silence) return;
     stage_count(&routing->stage, peer->silences, 1);
     counter_set(counters, peer->last_silence, silence);
     struct returned_event event = {.kind = EVENT_RETURNED, .endpoint = peer->id, .silence = silence};
@@ -194,8 +193,8 @@ static void hear(struct routing *routing, const struct received *received) {
     const struct peer *peer = received->peer;
     counter *last_seen = &routing->stage.counters[peer->last_seen];
     int64_t before = atomic_load_explicit(last_seen, memory_order_relaxed);
-    atomic_store_explicit(last_seen, received->received_at, memory_order_relaxed);
-    if (received->received_at - before > peer->pause) end_silence(routing, received, before, received->received_at - before);
+    atomic_store_explicit(last_seen, received->now, memory_order_relaxed);
+    if (!before || received->now - before > peer->pause) end_silence(routing, received, before);
 }
 
 /* ---- public ---- */

@@ -128,7 +128,7 @@ void route_ros_message(struct ros_routing *routing, const struct ros_topic *topi
     for (uint32_t index = 0; index < topic->route_count; index++) {
         const struct ros_route *route = &topic->routes[index];
         route_ros(routing, route, taken);
-        counter_set(stage->counters, route->last_message, taken->received_at);
+        counter_set(stage->counters, route->last_message, taken->now);
         count_duration(stage->counters, route->duration, LATENCY, stage->now(stage) - taken->now);
     }
 }

@@ -29,7 +29,7 @@ struct ros_route {
     struct targets targets;
     struct for_each for_each;
     uint16_t seconds, nanoseconds; /* slots of the message's stamp, or NONE */
-    uint32_t received, last_message, duration; /* counters; the last one is a histogram */
+    uint32_t received, last_message, duration; /* counters; the second one has the boot clock, the last one is a histogram */
 };
 
 struct ros_topic {
