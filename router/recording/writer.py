@@ -255,13 +255,13 @@ def recording_sizes(path: Path, stem: str) -> dict[Path, int]:
 
 
 def _numbered(path: Path, stem: str) -> Iterator[tuple[int, Path]]:
-    """Yield each recording of a table in `path` with its number: 0 if it has none, like those of version 1.0.0."""
+    """Yield each recording of a table in `path` with its number."""
     name = re.compile(
-        re.escape(stem) + r"(?:_(\d{6,}))?_\d{8}T\d{6}\.\d{6}Z(?:_[a-z0-9_.-]+)?" + re.escape(SUFFIX), re.ASCII
+        re.escape(stem) + r"_(\d{6,})_\d{8}T\d{6}\.\d{6}Z(?:_[a-z0-9_.-]+)?" + re.escape(SUFFIX), re.ASCII
     )
     for file in path.iterdir() if path.is_dir() else ():
         if found := name.fullmatch(file.name):
-            yield int(found[1] or 0), file
+            yield int(found[1]), file
 
 
 class ContinuousWriter:
