@@ -63,6 +63,11 @@ REMEDIES: Mapping[str, str] = {
     "mapping_error": "The mapping fails on these values, for example dividing by zero: see `router explain`.",
     "non_finite": "A value is NaN or infinite: check what the sender measures.",
     "too_large": "They are larger than the receiver accepts: see the log for the field and its limit.",
+    "superseded": (
+        "A newer command of another route disarmed their deadman. If it goes on, two senders command {target}: stop "
+        "one of them."
+    ),
+    "overloaded": "The gateway converts them more slowly than they arrive: exclude them, or lower their `rates`.",
     "missing_field": "A `required` field is missing: the sender must set it; the log names it.",
     "incomplete": "Datagrams of their frames are lost or late: check the link, or raise `timeout` of `collect`.",
     "source_mismatch": "No route accepts them from that address: run `router tap --only rejected` to see the senders.",

@@ -556,9 +556,15 @@ def test_each_reason_to_reject_a_datagram_has_a_remedy() -> None:
     assert {*metrics.REJECT_REASONS} - meant <= REMEDIES.keys()
 
 
+def test_each_loss_that_nobody_intends_has_a_remedy() -> None:
+    never = {"loop"}
+    assert {*metrics.DROP_REASONS, *metrics.GATEWAY_DROP_REASONS} - metrics.INTENDED_REASONS - never <= REMEDIES.keys()
+
+
 def test_remedies_are_of_reasons_that_there_are() -> None:
     assert REMEDIES.keys() <= {
         *metrics.DROP_REASONS,
+        *metrics.GATEWAY_DROP_REASONS,
         *metrics.REJECT_REASONS,
         *metrics.GATEWAY_REJECT_REASONS,
         *metrics.UNSAVED_REASONS,
