@@ -17,6 +17,14 @@ from router.threads import Thread, join_or_abandon
 MOST_MISMATCHES = 64
 """Maximum mismatches remembered, the latest ones: any stranger can cause them."""
 
+_EVENTS = {
+    "reject": "datagram rejected",
+    "supersede": "datagram has several payloads; only the last one counts",
+    "drop": "message dropped",
+    "deadman": "deadman could not send",
+}
+"""Log events by kind of report."""
+
 
 class Reporter:
     """Logs the first report of a kind at once, then summaries, in a thread of its own."""
@@ -61,43 +69,17 @@ class Reporter:
     def report(self, report: Report) -> None:
         if report.mismatch is not None:
             self._remember(report.mismatch)
-        if report.kind == "reject":
-            self._floods.note(
-                (report.place, report.reason),
-                logger.warning,
-                "datagram rejected",
-                times=report.times,
-                listener=report.place,
-                reason=report.reason,
-                detail=report.detail,
-            )
-            return
-        if report.kind == "supersede":
-            self._floods.note(
-                (report.place, report.kind),
-                logger.warning,
-                "datagram has several payloads; only the last one counts",
-                times=report.times,
-                listener=report.place,
-                detail=report.detail,
-            )
-            return
         if report.kind == "drop":
             self._lost[report.place, report.target] = boottime_ns(), report
-        event = "message dropped" if report.kind == "drop" else "deadman could not send"
-        detail = {"detail": report.detail} if report.detail else {}
-        error = {"error": self._text(report.error, report.target)} if report.error is not None else {}
+        error = self._text(report.error, report.target) if report.error is not None else ""
+        where = "listener" if report.kind in ("reject", "supersede") else "route"
+        values = {where: report.place, "target": report.target, "reason": report.reason, "error": error}
         self._floods.note(
             (report.kind, report.place, report.target, report.reason),
             logger.warning,
-            event,
-            None,
-            report.times,
-            route=report.place,
-            target=report.target,
-            reason=report.reason,
-            **error,
-            **detail,
+            _EVENTS[report.kind],
+            times=report.times,
+            **{key: value for key, value in {**values, "detail": report.detail}.items() if value},
         )
 
     def _text(self, error: BaseException, target: str) -> str:
