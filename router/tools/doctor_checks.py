@@ -306,7 +306,8 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
     yield problem(
         "ports",
         f"{what}: {holder} has {protocol} port {address.port}",
-        "stop it, or choose another port; run as root to see which process, and `systemctl status PID` for its service",
+        "stop it unless it is the router of this table, or choose another port; run as root to see which process, and "
+        "`systemctl status PID` for its service",
     )
 
 
@@ -439,17 +440,20 @@ def ros_peers(program: Program) -> Iterator[CheckResult]:
     except StartError as error:
         yield problem("ROS", error.what, error.hint)
         return
+    which = "another"
+    remedy = "do not start this one beside it: it would brake the rover at its start, and send commands twice"
+    if program.table.http is None:  # nothing tells whether that router runs this table
+        which, remedy = (
+            "a",
+            f"if it runs this table, add an `http.address`, so that doctor can ask it; if not, {remedy}",
+        )
     shared: dict[str, list[str]] = {}
     for each in sorted(found.shared):
-        router = f"process {each.router.process} on {each.router.host}"
+        router = f"{which} router runs, process {each.router.process} on {each.router.host}"
         what = "has the name of its node" if each.is_node else f"takes messages from {each.name}"
         shared.setdefault(router, []).append(what)
     for router, whats in shared.items():
-        yield warning(
-            "ROS",
-            f"another router runs, {router}: it {' and '.join(whats)}",
-            "do not start this one beside it: it would brake the rover at its start, and send commands twice",
-        )
+        yield warning("ROS", f"{router}: it {' and '.join(whats)}", remedy)
     if found.namesakes:
         name = program.table.node.name
         yield warning("ROS", f"another node is called {name}", "stop it, or give one of them another name")

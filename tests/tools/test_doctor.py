@@ -37,6 +37,7 @@ from router.tools.doctor_checks import (
     receive_buffers,
     recordings,
     ros,
+    ros_peers,
     shared_memory,
     warning,
 )
@@ -124,6 +125,10 @@ def test_what_a_router_would_meet_in_its_ros_domain_is_said_before_its_start(tab
         ]
         wait_until(lambda: of_ros(before_start) == met)  # discovery may take longer on a busy computer
         wait_until(lambda: set(met) <= set(of_ros(examine)))
+        rewritten(table, next(line for line in table.read_text().splitlines() if line.startswith("http: ")), "")
+        [of_any_table] = [each for each in ros_peers(compiled(table)) if who in each.text]
+        assert of_any_table.text.startswith(f"a router runs, {who}: it has the name of its node")
+        assert of_any_table.remedy.startswith("if it runs this table, add an `http.address`")
     assert of_ros(before_start) == []
 
 
