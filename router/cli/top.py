@@ -56,11 +56,12 @@ def _print_json(url: str, order: Order, interval: float) -> None:
     from router.tools.top import ordered
 
     try:
-        seen = _look(url, interval)
+        seen, table = _look(url, interval)
     except TransportError as error:
         print(json.dumps({"state": "down", "url": url, "problems": [down(url, error).json()]}))
         raise
-    print(json.dumps(asdict(seen) | {"routes": [asdict(row) for row in ordered(seen.routes, order)]}))
+    routes = [asdict(row) for row in ordered(seen.routes, order)]
+    print(json.dumps({"table": table, **asdict(seen), "routes": routes}))
 
 
 def _show_once(url: str, order: Order, interval: float) -> None:
@@ -69,18 +70,25 @@ def _show_once(url: str, order: Order, interval: float) -> None:
     from router.tools.top_view import Page
 
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+    seen, table = _look(url, interval)
     with console.capture() as shown:  # rich exits if a pipe is closed; `main` has an exit code for that
-        console.print(Page(_look(url, interval), order))
+        console.print(Page(seen, _title(table, url), order))
     print(shown.get(), end="")
 
 
-def _look(url: str, interval: float) -> View:
+def _look(url: str, interval: float) -> tuple[View, str]:
+    """Return the view, and the name of the table."""
     from router.tools.running_router import health, metrics
     from router.tools.top import view
 
     before = metrics(url)
     time.sleep(interval)
-    return view(before, metrics(url), health(url).problems)
+    after, found = metrics(url), health(url)
+    return view(before, after, found.problems), found.name
+
+
+def _title(table: str, url: str) -> str:
+    return f"{table} at {url}"
 
 
 _PLAIN_WIDTH = 160
@@ -99,14 +107,14 @@ def _show(url: str, order: Order, interval: float) -> None:
     console, orders = Console(), {each.key: each for each in Order}
     window, note, first = Window(), "", 0
     window.add(metrics(url))
-    problems = health(url).problems
+    found = health(url)
     with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    newest, problems = metrics(url), health(url).problems
+                    newest, found = metrics(url), health(url)
                 except TransportError as error:
                     note = str(error)
                 else:
@@ -114,8 +122,8 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            seen = view(*window.ends, problems)
-            shown = Screen(seen, f"router top {url}", order, console.height, note, first)
+            seen = view(*window.ends, found.problems)
+            shown = Screen(seen, _title(found.name, url), order, console.height, note, first)
             live.update(shown, refresh=True)
             try:
                 key = wait_for_key(max(due - time.monotonic(), 0.0))

@@ -79,7 +79,6 @@ class Status:
             "at": at,
             "started": self._started,
             "map": table.sha256,
-            "table": table.path.name,
             "ready": running.is_ready,
             **numbers(snapshot(running.collect(), at)),
             "problems": [problem.json() for problem in self._health.look().problems],
@@ -91,9 +90,10 @@ class Status:
         return {"numbers": [{"at": each.at, **numbers(each)} for each in self._health.look().snapshots]}
 
     def health(self) -> Json:
-        """Return all problems. `received`: datagrams since the start. `table`: the SHA-256 of the running table."""
+        """Return all problems. `name`, `table`: file name and SHA-256 of the table. `received`: since the start."""
         look = self._health.look()
         return {
+            "name": look.program.table.path.name,
             "table": look.program.table.sha256,
             "received": look.now.total("datagrams_received"),
             "problems": [problem.json() for problem in look.problems],
@@ -163,7 +163,8 @@ def _map_json(program: Program) -> Json:
     deadmen = [*deadman_edges(program)]
     halted = [endpoint_node(table.endpoints[each.label], "to", 2) for each in deadmen if each.label in table.endpoints]
     return {
-        "name": table.node.name,
+        "name": table.path.name,
+        "node": table.node.name,
         "listeners": {name: str(listener.address.value) for name, listener in table.listeners.items()},
         "pages": {
             gateway.name: list(gateway.address.value)

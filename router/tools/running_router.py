@@ -36,8 +36,9 @@ class Answer(NamedTuple):
 
 
 class Health(NamedTuple):
-    """What is wrong with a router that runs a table of this SHA-256, and how many datagrams it has received."""
+    """What is wrong with a router, which table it runs (file name and SHA-256), and the datagrams it has received."""
 
+    name: str
     table_sha256: str
     received: int
     problems: tuple[Problem, ...]
@@ -96,7 +97,7 @@ def health(url: str) -> Health:
     text, _ = _got(url, "/health.json")
     try:
         found = json.loads(text)
-        return Health(found["table"], found["received"], tuple(map(Problem.of, found["problems"])))
+        return Health(found["name"], found["table"], found["received"], tuple(map(Problem.of, found["problems"])))
     except (ValueError, LookupError, TypeError) as error:
         raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 

@@ -24,6 +24,9 @@ from router.values import age_text, rate_text, shortened
 _ENDPOINT_LINES = 4
 """Maximum lines of endpoints on a screen; silent endpoints are also among the problems above."""
 
+_STYLES = {"!": "bold red", "□": "dim"}
+"""Of problems by their sign; the second one is of what is inactive because nobody drives."""
+
 _LETTERS = 24
 """Maximum letters of an endpoint's name."""
 
@@ -111,9 +114,11 @@ class Page:
     """The whole display, to be printed once."""
 
     view: View
+    title: str
     order: Order
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self.title, style="bold", no_wrap=True, overflow="ellipsis")
         yield from _summary(self.view, options.max_width, sys.maxsize, len(self.view.silence))
         yield RouteTable(self.view, self.order, len(self.view.routes) + 1)
 
@@ -138,22 +143,23 @@ def _summary(view: View, width: int, problem_lines: int, endpoint_lines: int) ->
     totals = [whole] if len(whole) <= width else [flow, losses]
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
     lines += _problems(view, width, problem_lines)
-    if view.calm:
-        lines.append(Text("; ".join(view.calm), style="dim", no_wrap=True, overflow="ellipsis"))
     return [*lines, *_last_heard(view, width, endpoint_lines)]
 
 
 def _problems(view: View, width: int, most: int) -> list[Text]:
     """Return the problems below each other, wrapped at words; those that do not fit are counted."""
-    wrapped = [
-        textwrap.wrap(f"! {each}", width, subsequent_indent="  ", break_on_hyphens=False) for each in view.problems
+    told = [*(("!", each) for each in view.problems), *(("□", each) for each in view.calm)]
+    lines = [
+        (number, sign, line)
+        for number, (sign, text) in enumerate(told, 1)
+        for line in textwrap.wrap(f"{sign} {text}", width, subsequent_indent="  ", break_on_hyphens=False)
     ]
-    lines = [line for problem in wrapped for line in problem]
     if len(lines) > most:
-        lines, hidden = lines[: max(most - 1, 1)], lines[max(most - 1, 1) :]
-        if (more := sum(line.startswith("!") for line in hidden)) and most > 1:
-            lines.append(f"! and {more} more: see `router doctor`")
-    return [Text(line, style="bold red", no_wrap=True, overflow="ellipsis") for line in lines]
+        lines = lines[: max(most - 1, 1)]
+        if (more := len(told) - lines[-1][0]) and most > 1:
+            sign, _ = told[-more]
+            lines.append((len(told), sign, f"{sign} and {more} more: see `router doctor`"))
+    return [Text(line, style=_STYLES[sign], no_wrap=True, overflow="ellipsis") for _, sign, line in lines]
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:

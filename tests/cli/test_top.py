@@ -42,8 +42,9 @@ def served() -> Iterator[str]:
 def test_without_a_terminal_it_is_shown_once(served: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", served, "--interval", "10ms", "--sort", "drops"]) == OK
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("in 7 (0/s), delivered 7")
-    assert [line.split()[0] for line in lines[3:]] == ["gps_info", "imu_info"]
+    assert lines[0] == f"rover.yaml at {served}"
+    assert lines[1].startswith("in 7 (0/s), delivered 7")
+    assert [line.split()[0] for line in lines[4:]] == ["gps_info", "imu_info"]
 
 
 @pytest.mark.parametrize("more", ["", "endpoints: {arm_board: {kind: bord}}\n"], ids=["good", "with errors"])

@@ -110,7 +110,7 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
     running.count("config_last_reload_successful", to=1)
     running.count("datagrams_received", "rover", to=7)
     sound = ask(server, "/health.json").json
-    assert sound == {"table": running.program.table.sha256, "received": 7, "problems": []}
+    assert sound == {"name": "sim.yaml", "table": running.program.table.sha256, "received": 7, "problems": []}
     running.count("deadman_active", "manual_drive", to=1)
     [problem] = ask(server, "/health.json").json["problems"]
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")
@@ -164,7 +164,7 @@ def test_no_page_says_where_the_table_is(server: HttpServer, running: FakeRunnin
     path = running.program.table.path
     for page in ("/", "/status.json", "/recent.json", "/map.json", "/metrics", "/healthz", "/ready", "/nothing"):
         assert f"{path.parent.name}/{path.name}" not in ask(server, page).text, page
-    assert ask(server, "/status.json").json["table"] == path.name
+    assert ask(server, "/map.json").json["name"] == path.name
 
 
 def test_an_order_to_reload_says_what_came_of_it(server: HttpServer, running: FakeRunning) -> None:

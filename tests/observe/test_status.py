@@ -95,7 +95,7 @@ def test_every_line_of_the_map_has_its_numbers(shown: Status) -> None:
 
 def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Status) -> None:
     drawn = shown.map()
-    assert (drawn["name"], drawn["keeps"]) == ("rover_router", None)
+    assert (drawn["name"], drawn["node"], drawn["keeps"]) == ("sim.yaml", "rover_router", None)
     assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
     [drive] = [each for each in drawn["deadmen"] if each["route"] == "manual_drive"]
     assert (drive["start"], drive["end"], drive["label"]) == ("case:manual_drive", "to:@driving_board", "driving_board")

@@ -29,7 +29,7 @@ def answering(
     """
     if health is None:
         listed = [problem.json() for problem in problems]
-        health = json.dumps({"table": table, "received": 7, "problems": listed})
+        health = json.dumps({"name": "rover.yaml", "table": table, "received": 7, "problems": listed})
     answers = {"/metrics": text, "/health.json": health}
 
     class Handler(BaseHTTPRequestHandler):

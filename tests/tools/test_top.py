@@ -22,6 +22,7 @@ from router.values import age_text
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in LATENCY_BOUNDS_NS), "+Inf")
 PATIENCE = 30.0
+TITLE = "rover.yaml at http://127.0.0.1:9108"
 
 
 def buckets(route: str, *counts: int) -> Counts:
@@ -68,7 +69,8 @@ def printed(shown: object, width: int = 120) -> list[str]:
 
 
 def test_a_page_has_all_of_it() -> None:
-    assert printed(Page(SEEN, Order.TABLE)) == [
+    assert printed(Page(SEEN, TITLE, Order.TABLE)) == [
+        TITLE,
         "in 113 (55/s), delivered 115 (55/s), lost 3 malformed, 3 stale",
         "! sensor_board is silent: last heard 1 s ago",
         f"! {HELD.words}",
@@ -78,7 +80,7 @@ def test_a_page_has_all_of_it() -> None:
         "gps_info 5.0 basestation 5.0 150 us 199 us never 3 stale",
     ]
     well = replace(SEEN, silence={}, silent=(), problems=(), kernel_drops=7)
-    assert printed(Page(well, Order.TABLE))[:2] == [
+    assert printed(Page(well, TITLE, Order.TABLE))[1:3] == [
         "in 113 (55/s), delivered 115 (55/s), lost 7 kernel_drops, 3 malformed, 3 stale",
         "route in/s endpoints topics p50 p99 age drops",
     ]
@@ -88,8 +90,8 @@ def test_a_route_that_is_halted_because_nobody_drives_is_no_alarm() -> None:
     halted = Problem(Kind.HALTED, {"route": "imu_info"}, " for 27 min", routes=("imu_info",))
     seen = view(snapshot(10, 0, 0), snapshot(12, 100, 10), [halted])
     assert (seen.problems, seen.calm) == ((), ("imu_info is halted: no commands for 27 min",))
-    assert printed(Page(seen, Order.TABLE))[1] == "imu_info is halted: no commands for 27 min"
-    assert not any(line.startswith("!") for line in printed(Page(seen, Order.TABLE)))
+    assert printed(Page(seen, TITLE, Order.TABLE))[2] == "□ imu_info is halted: no commands for 27 min"
+    assert not any(line.startswith("!") for line in printed(Page(seen, TITLE, Order.TABLE)))
 
 
 def test_problems_are_below_each_other_and_wrapped() -> None:
@@ -103,13 +105,28 @@ def test_problems_are_below_each_other_and_wrapped() -> None:
         "! d is silent: last heard 12 s ago, by another address",
     ]
     assert "! and 3 more: see `router doctor`" in lines_of(Screen(seen, "t", Order.TABLE, 12), 80)
-    assert len([line for line in lines_of(Page(seen, Order.TABLE), 80) if line.startswith("! ")]) == 4
+    assert len([line for line in lines_of(Page(seen, TITLE, Order.TABLE), 80) if line.startswith("! ")]) == 4
+
+
+def test_what_is_calm_has_a_line_each_too_after_the_problems() -> None:
+    calm = tuple(
+        f"{name} is halted: no commands for 27 min, and basestation is silent" for name in ("a" * 40, "b", "c")
+    )
+    seen = replace(SEEN, problems=("d is silent",), calm=calm, silence={})
+    assert lines_of(Screen(seen, "t", Order.TABLE, 30), 80)[2:7] == [
+        "! d is silent",
+        f"□ {'a' * 40} is halted: no commands for 27 min,",
+        "  and basestation is silent",
+        "□ b is halted: no commands for 27 min, and basestation is silent",
+        "□ c is halted: no commands for 27 min, and basestation is silent",
+    ]
+    assert "□ and 3 more: see `router doctor`" in lines_of(Screen(seen, "t", Order.TABLE, 10), 80)
 
 
 def test_a_deadman_that_sends_for_want_of_commands_says_so_in_place_of_drops() -> None:
     (row, *others) = SEEN.routes
     halted = replace(SEEN, routes=(replace(row, rate=0.0, is_tripped=True), *others))
-    assert printed(Page(halted, Order.TABLE))[5].endswith("none accepted")
+    assert printed(Page(halted, TITLE, Order.TABLE))[6].endswith("none accepted")
 
 
 @pytest.mark.parametrize("height", [7, 8, 24])
@@ -141,7 +158,7 @@ FULL = View(
 
 @pytest.mark.parametrize(("width", "height"), [(60, 20), (80, 24), (100, 30), (160, 40)])
 def test_nothing_is_wrapped_and_every_route_shows_its_destinations(width: int, height: int) -> None:
-    lines = lines_of(Screen(FULL, "router top http://127.0.0.1:9108", Order.TABLE, height), width)
+    lines = lines_of(Screen(FULL, TITLE, Order.TABLE, height), width)
     assert len(lines) == height
     assert max(map(len, lines)) <= width
     first = next(index for index, line in enumerate(lines) if line.startswith("route "))
@@ -222,7 +239,7 @@ def test_what_is_lost_now_is_told_from_what_was_lost_before() -> None:
     assert not other.is_losing
     assert losing.is_losing
     seen = replace(SEEN, routes=(losing,))
-    assert printed(Page(seen, Order.TABLE))[-1] == "gps_info 0 !basestation 0 - - never !4 stale"
+    assert printed(Page(seen, TITLE, Order.TABLE))[-1] == "gps_info 0 !basestation 0 - - never !4 stale"
 
 
 def test_targets_show_what_they_got_lost_and_were_spared() -> None:
@@ -326,6 +343,6 @@ def test_what_the_table_wants_gone_is_not_lost() -> None:
     seen = view(snapshot(0, 1), snapshot(1, 1, messages_dropped=dropped))
     row = seen.routes[0]
     assert (row.dropped, row.lost, row.targets[1].lost) == ({"stale": 2, "rate_limited": 8}, {"stale": 2}, {"stale": 2})
-    assert printed(Page(seen, Order.TABLE))[0] == (
+    assert printed(Page(seen, TITLE, Order.TABLE))[1] == (
         "in 4 (0/s), delivered 6 (0/s), lost 3 malformed, 2 stale; as the table wants 8 rate_limited"
     )
