@@ -101,8 +101,8 @@ def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
 
 
 def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: Iterator[Entry], first: Entry) -> None:
-    from router.tools.show import Filter, shown
-    from router.tools.tap import Condition
+    from router.tools.show import shown
+    from router.tools.tap import Condition, Filter
 
     cases = [wire.case(name) for name in args.cases] or list(wire.envelope.cases.values())
     if args.where and not cases:
@@ -117,7 +117,7 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
             last = entry.at
             if span is None or span[0] <= entry.at <= span[1]:
                 as_shown = shown(entry, wire)
-                if chosen.takes(entry, as_shown):
+                if chosen.takes(as_shown, entry.at):
                     yield as_shown.json(False) if args.json else as_shown.line(False)
 
     made = lines()

@@ -1,4 +1,4 @@
-"""`router tap [CASE...]`: print what a running router receives, one line per datagram."""
+"""`router tap [CASE...]`: print what a running router receives and sends by itself, one line per datagram."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from router.cli.tool_options import (
 )
 
 _DESCRIPTION = """Print what a running router receives: the fields that are not at their default, and the reason for
-each rejected datagram. The router is reached at the table's 'http.address', on this computer. It never waits for this
-terminal; datagrams that the terminal missed are counted. To listen at a port or a ROS topic without a router, use
-'router listen'."""
+each rejected datagram. Without --from and --only, also print the commands that it sends, and what its deadmen do. The
+router is reached at the table's 'http.address', on this computer. It never waits for this terminal; lines that the
+terminal missed are counted. To listen at a port or a ROS topic without a router, use 'router listen'."""
 _EXAMPLES = (
     "router tap imu_info gps_info -t routes/sim.yaml",
     "router tap --from arm_board --for 10s",
@@ -57,14 +57,14 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     from router.threads import background_threads
     from router.tools.running_router import tap
-    from router.tools.tap import Condition, RunningTap
+    from router.tools.tap import Condition, Filter, RunningTap
 
     url = running_url(args)
     wire, _ = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
     cases = cases or list(wire.envelope.cases.values())
     condition = Condition(args.where, wire.envelope, cases) if args.where else None
-    taken = RunningTap(wire, args.cases, condition)
+    taken = RunningTap(wire, Filter(args.cases, condition))
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router has priority over observers on its computer.
     with background_threads(), tap(url, wanted, args.sources, args.only) as batches:
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
                 print_batches(taken.take(batches), args)
         finally:
             if taken.missed:
-                say(f"{taken.missed} datagrams are not shown, as this terminal was too slow; the router routed them")
+                say(f"{taken.missed} lines are not shown, as this terminal was too slow; the router routed them")
             if condition is not None and condition.failure:
                 say(f"payloads for which --where has no value are not shown: {condition.failure}")
     return 0

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from router.compiler.program import Program
     from router.datagrams import Wire
     from router.table.model import RouteTable
-    from router.tools.tap import TappedDatagram, TappedMessage
+    from router.tools.tap import ShownAction, TappedDatagram, TappedMessage
 
 
 TABLE_VARIABLE = "ROUTER_TABLE"
@@ -180,7 +180,9 @@ def until_interrupted() -> Iterator[None]:
 
 
 def print_batches(
-    batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace, waited: float = 0.0
+    batches: Iterable[Sequence[TappedDatagram | ShownAction | TappedMessage]],
+    args: argparse.Namespace,
+    waited: float = 0.0,
 ) -> None:
     """Print until --count or --for is reached; `waited` seconds of --for are already over.
 

@@ -360,7 +360,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         if self.command == "HEAD":
             return
-        with closing(Tap(running.mirror, is_wanted)) as tap:
+        with closing(Tap(running.mirror, is_wanted, with_actions=not sources and not decisions)) as tap:
             self._send()  # at once: from the response on, the client misses nothing
             self._out = BytesIO()
             self._stream(tap.stream())

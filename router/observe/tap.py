@@ -9,7 +9,7 @@ The stream is MAGIC, then records, each preceded by its length: `<uint32 length>
 
 Listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16), as are those of
 ACTED, which are the fields of an Action. A datagram longer than the router accepts is cut to one byte more than that.
-Only a tap without a filter has actions.
+A tap that is limited to senders or decisions has no actions; any other has all of them.
 """
 
 from __future__ import annotations
@@ -109,9 +109,9 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
 
 
 class Tap:
-    """A stream of the datagrams received until `close`. A slow reader misses some."""
+    """A stream of the wanted datagrams, and the actions, until `close`. A slow reader misses some."""
 
-    def __init__(self, mirror: Mirror, is_wanted: Wanted | None) -> None:
+    def __init__(self, mirror: Mirror, is_wanted: Wanted | None, *, with_actions: bool = True) -> None:
         self._mirror = mirror
         self._is_wanted = is_wanted
         self._pieces: deque[bytes] = deque()
@@ -120,7 +120,7 @@ class Tap:
         self._lost_before = mirror.lost
         self._changed = threading.Condition()
         self._is_closed = False
-        self._detach = mirror.attach(self._take, self._take_actions if is_wanted is None else None)
+        self._detach = mirror.attach(self._take, self._take_actions if with_actions else None)
 
     def stream(self) -> Iterator[bytes]:
         """Yield pieces as soon as there are any, at least one per second. Ends after `close`."""

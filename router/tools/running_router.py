@@ -113,12 +113,12 @@ def down(url: str, error: TransportError) -> Problem:
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = (), only: str | None = None
 ) -> Iterator[Iterator[list[MirroredDatagram | Action | Lost]]]:
-    """Open a tap of the datagrams that a running router receives.
+    """Open a tap of the datagrams that a running router receives, and of its actions.
 
-    Only those with these payload cases, from these endpoints (empty: all) and with this decision (`only`: one of
-    DECISIONS; None: both). They arrive in batches; while nothing is received, an empty batch arrives each second.
-    Datagrams without a known payload case are always included, actions only if no filter is given. Raises UsageError if
-    the router rejects the request, TransportError if none answers, or later if the router stops.
+    Only datagrams with these payload cases, from these endpoints (empty: all) and with this decision (`only`: one of
+    DECISIONS; None: both). They arrive in batches; while there is nothing, an empty batch arrives each second.
+    Datagrams without a known payload case are always included; actions unless `sources` or `only` is given. Raises
+    UsageError if the router rejects the request, TransportError if none answers, or later if the router stops.
     """
     parameters = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(parameters + ([("only", only)] if only else []))

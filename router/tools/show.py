@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import datetime as dt
 import heapq
-import json
 import re
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 
-from google.protobuf.json_format import MessageToDict
-
-from router.datagrams import Decoded, Wire
-from router.errors import DecodeError, UsageError
-from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action
+from router.datagrams import Wire
+from router.errors import UsageError
 from router.recording.reader import Recorded, RecordedAction
-from router.tools.tap import Condition, TappedDatagram, local_time, tapped_datagram, utc_text
-from router.values import clock_text, compact
+from router.tools.tap import ShownAction, TappedDatagram, local_time, shown_action, tapped_datagram
 
 Entry = Recorded | RecordedAction
 
@@ -63,79 +57,9 @@ def window(around: str, margin: float, first: int) -> tuple[int, int]:
     return start - extra, start + (1 if has_seconds else 60) * 1_000_000_000 + extra
 
 
-@dataclass(frozen=True, slots=True)
-class ShownAction:
-    """An action: its time (local time), and what it sent, if it did."""
-
-    at: dt.datetime
-    action: Action
-    decoded: Decoded | None
-
-    def line(self, with_hex: bool = False) -> str:
-        """Return one line: `12:00:00.123+0200 sent to driving_board (drive from topic cmd): drive left=5`."""
-        del with_hex  # nothing is shown in hexadecimal
-        return f"{clock_text(self.at)} {self._what()}"
-
-    def _what(self) -> str:
-        it = self.action
-        deadman = f"the deadman of {it.route}"
-        if it.what == TRIPPED:
-            return f"{deadman} tripped"
-        if it.what == RELEASED:
-            return f"{deadman} was released: a command was sent"
-        source = f" from topic {it.topic}" if it.topic else ""
-        if it.what == LOST:
-            return f"not sent to {it.target} ({it.route}{source}): {self._why_not()}"
-        by = deadman if it.what == BRAKED else f"{it.route}{source}"
-        if it.reason:
-            return f"not sent to {it.target} ({by}): {self._why_not()}"
-        return f"sent to {it.target} ({by}): {self._payload()}"
-
-    def _why_not(self) -> str:
-        return ": ".join(filter(None, (self.action.reason, self.action.detail)))
-
-    def _payload(self) -> str:
-        if self.decoded is None:
-            return f"undecodable: {self.action.data.hex()}"
-        return f"{self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}".rstrip()
-
-    def json(self, with_hex: bool = False) -> str:
-        """Return one JSON object."""
-        del with_hex
-        it = self.action
-        document: dict[str, object] = {"time": utc_text(self.at), "action": it.what, "route": it.route}
-        texts = {"endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
-        document |= {key: text for key, text in texts.items() if text}
-        if self.decoded is not None:
-            document["case"] = self.decoded.case.name
-            document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
-        return json.dumps(document)
-
-
 def shown(entry: Entry, wire: Wire) -> TappedDatagram | ShownAction:
     """Return an entry as it is printed."""
-    if isinstance(entry, Recorded):
-        peer = entry.endpoint or f"{entry.peer[0]}:{entry.peer[1]}"
-        return tapped_datagram(entry.at, peer, entry.data, wire, entry.reason)
-    action = entry.action
-    try:
-        decoded = wire.decode(action.data) if action.what in (SENT, BRAKED) and action.data else None
-    except DecodeError:
-        decoded = None
-    return ShownAction(local_time(action.at), action, decoded)
-
-
-class Filter:
-    """Selects payloads of `cases` that fulfil `condition`; without either, everything."""
-
-    def __init__(self, cases: Collection[str], condition: Condition | None) -> None:
-        self._cases = cases
-        self._condition = condition
-
-    def takes(self, entry: Entry, as_shown: TappedDatagram | ShownAction) -> bool:
-        if not self._cases and self._condition is None:
-            return True
-        if (decoded := as_shown.decoded) is None or (self._cases and decoded.case.name not in self._cases):
-            return False
-        sender = as_shown.peer if isinstance(as_shown, TappedDatagram) else ""
-        return self._condition is None or self._condition.holds(decoded.case.name, decoded.message, sender, entry.at)
+    if isinstance(entry, RecordedAction):
+        return shown_action(entry.action, wire)
+    peer = entry.endpoint or f"{entry.peer[0]}:{entry.peer[1]}"
+    return tapped_datagram(entry.at, peer, entry.data, wire, entry.reason)

@@ -24,7 +24,7 @@ from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
-from router.recording.mirror import Action, MirroredDatagram
+from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.model import Expression
 from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
@@ -156,6 +156,55 @@ class TappedDatagram:
 
 
 @dataclass(frozen=True, slots=True)
+class ShownAction:
+    """An action: its time (local time), and what it sent, if it did."""
+
+    at: dt.datetime
+    action: Action
+    decoded: Decoded | None
+
+    def line(self, with_hex: bool = False) -> str:
+        """Return one line: `12:00:00.123+0200 sent to driving_board (drive from topic cmd): drive left=5`."""
+        del with_hex  # nothing is shown in hexadecimal
+        return f"{clock_text(self.at)} {self._what()}"
+
+    def _what(self) -> str:
+        it = self.action
+        deadman = f"the deadman of {it.route}"
+        if it.what == TRIPPED:
+            return f"{deadman} tripped"
+        if it.what == RELEASED:
+            return f"{deadman} was released: a command was sent"
+        source = f" from topic {it.topic}" if it.topic else ""
+        if it.what == LOST:
+            return f"not sent to {it.target} ({it.route}{source}): {self._why_not()}"
+        by = deadman if it.what == BRAKED else f"{it.route}{source}"
+        if it.reason:
+            return f"not sent to {it.target} ({by}): {self._why_not()}"
+        return f"sent to {it.target} ({by}): {self._payload()}"
+
+    def _why_not(self) -> str:
+        return ": ".join(filter(None, (self.action.reason, self.action.detail)))
+
+    def _payload(self) -> str:
+        if self.decoded is None:
+            return f"undecodable: {self.action.data.hex()}"
+        return f"{self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}".rstrip()
+
+    def json(self, with_hex: bool = False) -> str:
+        """Return one JSON object."""
+        del with_hex
+        it = self.action
+        document: dict[str, object] = {"time": utc_text(self.at), "action": it.what, "route": it.route}
+        texts = {"endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
+        document |= {key: text for key, text in texts.items() if text}
+        if self.decoded is not None:
+            document["case"] = self.decoded.case.name
+            document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
+        return json.dumps(document)
+
+
+@dataclass(frozen=True, slots=True)
 class TappedMessage:
     """One ROS message: when it arrived (local time), its type, its CDR bytes, and rclpy's object of them."""
 
@@ -190,45 +239,47 @@ def local_time(at: int) -> dt.datetime:
     return dt.datetime.fromtimestamp(at / 1e9).astimezone()
 
 
-class RunningTap:
-    """Decodes what a running router receives. `missed` counts datagrams not sent because this reader is too slow.
+class Filter:
+    """Selects payloads of `cases` that fulfil `condition`; without either, everything, even without a payload."""
 
-    Selects payloads of `cases` that fulfil `condition`; without either, all datagrams, even without a payload.
-    """
-
-    def __init__(
-        self,
-        wire: Wire,
-        cases: Collection[str] = (),
-        condition: Condition | None = None,
-    ) -> None:
-        self.missed = 0
-        self._wire = wire
+    def __init__(self, cases: Collection[str] = (), condition: Condition | None = None) -> None:
         self._cases = cases
         self._condition = condition
 
-    def take(self, batches: Iterable[list[MirroredDatagram | Action | Lost]]) -> Iterator[list[TappedDatagram]]:
+    def takes(self, shown: TappedDatagram | ShownAction, at: int) -> bool:
+        """`at`: its time in ns since 1970."""
+        if not self._cases and self._condition is None:
+            return True
+        if (decoded := shown.decoded) is None or (self._cases and decoded.case.name not in self._cases):
+            return False
+        sender = shown.peer if isinstance(shown, TappedDatagram) else ""
+        return self._condition is None or self._condition.holds(decoded.case.name, decoded.message, sender, at)
+
+
+class RunningTap:
+    """Decodes what a running router receives and does. `missed` counts what it did not send to a slow reader."""
+
+    def __init__(self, wire: Wire, chosen: Filter) -> None:
+        self.missed = 0
+        self._wire = wire
+        self._filter = chosen
+
+    def take(
+        self, batches: Iterable[list[MirroredDatagram | Action | Lost]]
+    ) -> Iterator[list[TappedDatagram | ShownAction]]:
         """Yield the part of each batch that is to be shown, which may be empty."""
         for batch in batches:
-            shown = []
-            for each in batch:
-                if isinstance(each, Lost):
-                    self.missed += each.number
-                if not isinstance(each, MirroredDatagram):
-                    continue
-                peer = each.endpoint or f"{each.peer[0]}:{each.peer[1]}"
-                tapped = tapped_datagram(each.at, peer, each.data, self._wire, each.reason)
-                if self._is_wanted(tapped, each.at):
-                    shown.append(tapped)
-            yield shown
+            self.missed += sum(each.number for each in batch if isinstance(each, Lost))
+            found = [each for each in batch if not isinstance(each, Lost)]
+            found.sort(key=lambda each: each.at)  # actions come apart from datagrams
+            made = [(self._shown(each), each.at) for each in found]
+            yield [shown for shown, at in made if self._filter.takes(shown, at)]
 
-    def _is_wanted(self, tapped: TappedDatagram, at: int) -> bool:
-        if tapped.decoded is None:
-            return not self._cases and self._condition is None
-        case, payload = tapped.decoded.case.name, tapped.decoded.message
-        if self._cases and case not in self._cases:
-            return False
-        return self._condition is None or self._condition.holds(case, payload, tapped.peer, at)
+    def _shown(self, each: MirroredDatagram | Action) -> TappedDatagram | ShownAction:
+        if isinstance(each, Action):
+            return shown_action(each, self._wire)
+        peer = each.endpoint or f"{each.peer[0]}:{each.peer[1]}"
+        return tapped_datagram(each.at, peer, each.data, self._wire, each.reason)
 
 
 def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
@@ -260,3 +311,11 @@ def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str =
         return TappedDatagram(local_time(at), peer, data, wire.decode(data), rejected=rejected)
     except DecodeError as error:
         return TappedDatagram(local_time(at), peer, data, None, str(error), rejected)
+
+
+def shown_action(action: Action, wire: Wire) -> ShownAction:
+    try:
+        decoded = wire.decode(action.data) if action.what in (SENT, BRAKED) and action.data else None
+    except DecodeError:
+        decoded = None
+    return ShownAction(local_time(action.at), action, decoded)

@@ -71,7 +71,7 @@ def test_all_that_is_received_is_shown_as_it_came_with_what_was_decided(running:
     ]
 
 
-def test_a_tap_without_a_filter_shows_actions(running: FakeRunning) -> None:
+def test_a_tap_shows_actions_unless_it_is_limited_to_what_was_received(running: FakeRunning) -> None:
     actions = [
         Action(7, "sent", "drive", "driving_board", "cmd", data=IMU),
         Action(8, "lost", "drive", "driving_board", "", "stale", "sent 2 s ago"),
@@ -80,7 +80,7 @@ def test_a_tap_without_a_filter_shows_actions(running: FakeRunning) -> None:
     with closing(Tap(running.mirror, None)) as tap:
         running.acted += actions
         assert read(tap.stream(), 3) == actions
-    with closing(Tap(running.mirror, wanted(PROGRAM, [], ["sensor_board"]))) as tap:
+    with closing(Tap(running.mirror, wanted(PROGRAM, [], ["sensor_board"]), with_actions=False)) as tap:
         running.acted += actions
         running.receive(IMU, BOARD)
         assert [type(each) for each in read(tap.stream(), 1)] == [MirroredDatagram]

@@ -9,8 +9,10 @@ import pytest
 
 from router.datagrams import Wire
 from router.errors import UsageError
+from router.observe.tap import Lost
+from router.recording.mirror import BRAKED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.addresses import Address
-from router.tools.tap import Condition, listen, tapped_datagram
+from router.tools.tap import Condition, Filter, RunningTap, listen, tapped_datagram
 from router.tools.udp import open_udp
 from router.values import payload
 from tests.observe.fake_running import sim_program
@@ -57,6 +59,37 @@ def test_json_has_the_fields_by_their_proto_names(wire: Wire) -> None:
     said = json.loads(tapped_datagram(0, "board", datagram(wire, "point.x=3", "single=nan"), wire).json(with_hex=False))
     assert said["fields"] == {"single": "NaN", "point": {"x": 3}}
     assert (said["case"], said["peer"], said["bytes"], "hex" in said) == ("every_kind", "board", 11, False)
+
+
+@pytest.mark.parametrize(
+    ("cases", "shown"),
+    [
+        (
+            (),
+            [
+                "board every_kind i32=5",
+                "sent to board (drive from topic cmd): every_kind i32=5",
+                "the deadman of drive tripped",
+                "sent to board (the deadman of drive): plain (all default)",
+            ],
+        ),
+        (("plain",), ["sent to board (the deadman of drive): plain (all default)"]),
+    ],
+)
+def test_a_running_router_shows_what_it_receives_and_sends_in_order(
+    wire: Wire, cases: tuple[str, ...], shown: list[str]
+) -> None:
+    command, brake = datagram(wire, "i32=5"), wire.encode(wire.case("plain"), payload(wire.case("plain"), []))
+    actions = [
+        Action(2, SENT, "drive", "board", "cmd", data=command),
+        Action(3, TRIPPED, "drive"),
+        Action(4, BRAKED, "drive", "board", data=brake),
+    ]
+    tap = RunningTap(wire, Filter(cases))
+    received = MirroredDatagram(1, "here", ("127.0.0.2", 5), "board", "", command)
+    [batch] = tap.take([[*actions, received, Lost(7)]])
+    assert [each.line(with_hex=False).split(" ", 1)[1] for each in batch] == shown
+    assert tap.missed == 7
 
 
 def test_datagrams_are_heard_in_order(wire: Wire) -> None:
