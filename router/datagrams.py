@@ -72,7 +72,7 @@ class Wire:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
-        name = outer.WhichOneof(self.envelope.oneof)
+        name = outer.WhichOneof(self.envelope.oneof) if self.envelope.cases else None
         if name is None:
             reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)

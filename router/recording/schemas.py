@@ -34,7 +34,8 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
                 pool.AddSerializedFile(file.SerializeToString())
     own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
     message = own.message_type.add(name="Recorded")
-    message.oneof_decl.add(name=_ONEOF)
+    if named:  # protobuf refuses an empty oneof
+        message.oneof_decl.add(name=_ONEOF)
     for number, case in named.items():
         kind, label = FieldDescriptorProto.TYPE_MESSAGE, FieldDescriptorProto.LABEL_OPTIONAL
         message.field.add(
