@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from functools import cache
 from socket import inet_ntoa
 
@@ -56,7 +57,7 @@ class ActionRing:
                 reason, detail, data = self._outcome(it, rest)
                 target, topic = self._name_or_none(it.target), self._name_or_none(it.topic)
                 what = Action(it.action).name.lower()
-                taken.append((it.at, what, self._name(it.route), target, topic, reason, detail, data))
+                taken.append((it.at, what, self._name_or_none(it.route), target, topic, reason, detail, data))
                 position += it.size
         return taken
 
@@ -64,7 +65,9 @@ class ActionRing:
         return self._name(number) if number != NO_NAME else ""
 
     def _outcome(self, it: ActionRecord, rest: bytes) -> tuple[str, str, bytes]:
-        """Return why the datagram was not sent, with details, and the datagram."""
+        """Return why the datagram was not sent, with details (of a return: its silence), and the datagram."""
+        if it.action == Action.RETURNED:
+            return "", f"{int.from_bytes(rest, sys.byteorder) / 1e9:.1f} s", b""
         error = os.strerror(it.error) if it.error else ""
         if it.action != Action.LOST:
             return "send_error" if error else "", error, rest

@@ -135,6 +135,7 @@ def _explain(
 ) -> None:
     from router.recording.about import routes_of
     from router.tools.stops import Stops
+    from router.tools.tap import shown_action
 
     stops, last, span = Stops(routes_of(recording.about), wire), first.at, _window(args, first)
     for entry in entries:
@@ -147,6 +148,10 @@ def _explain(
             print(stop.json())
         else:
             print("\n".join(([""] if number else []) + stop.lines()))
+    for each in stops.silences:
+        if span is None or span[0] <= each.at <= span[1]:
+            silence = shown_action(each, wire)
+            print(silence.json() if args.json else silence.line())
     if not found and span is not None:
         _say_nothing(span, "no deadman tripped", last)
     elif not found and not stops.has_actions:

@@ -48,9 +48,10 @@ Mirrored = tuple[int, str, Peer, str, str, bytes]
 class Action(NamedTuple):
     """What the router did by itself. `at`: when it did that (wall clock, ns).
 
-    `what` is one of ACTIONS: a command was `sent`; a deadman has `braked`, `tripped` or was `released`; a message for
-    an endpoint was `lost`. `target` is the endpoint, `topic` the ROS topic of the message or "". `reason` and `detail`
-    say why something was not sent. `data` is the datagram, empty for a lost message.
+    `what` is one of ACTIONS: a command was `sent`; a deadman has `braked`, `tripped`, or was `released` or `fed` by a
+    message of a gateway's client; a message for an endpoint was `lost`; an endpoint that was silent has `returned`.
+    `target` is the endpoint, `topic` the ROS topic of the message or "". `reason` and `detail` say why something was
+    not sent, or how long the silence was. `data` is the datagram, if there is one.
     """
 
     at: int
@@ -63,7 +64,15 @@ class Action(NamedTuple):
     data: bytes = b""
 
 
-SENT, BRAKED, LOST, TRIPPED, RELEASED = ACTIONS = ("sent", "braked", "lost", "tripped", "released")
+ACTIONS = SENT, BRAKED, LOST, TRIPPED, RELEASED, FED, RETURNED = (
+    "sent",
+    "braked",
+    "lost",
+    "tripped",
+    "released",
+    "fed",
+    "returned",
+)
 
 Acted = tuple[int, str, str, str, str, str, str, bytes]
 """The fields of an Action as a plain tuple."""

@@ -11,7 +11,7 @@ from router.datagrams import Wire
 from router.observe.health import REMEDIES
 from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
-from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, first_field
+from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, first_field
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model import ANY
 from router.tools.tap import local_time, utc_text
@@ -57,7 +57,10 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Fed:
-    """The last command that fed a deadman: when it was sent (ns), its payload, and who sent it."""
+    """The last command that fed a deadman: when it was sent (ns), its payload, and who sent it.
+
+    Of a message of a gateway's client, recordings have only the time: `case` is "".
+    """
 
     at: int
     case: str
@@ -70,8 +73,9 @@ class Stop:
     """A deadman that tripped `at` a time (ns).
 
     `lost` are the commands of its route that did not get through since `fed`. `heard` and `heard_again`: when each
-    source was heard last before the stop, and first after it. `brakes` counts what the deadman sent, by payload case,
-    endpoint and reason of failure ("" if it was sent). `obeyed` tells which boards have shown that they stopped.
+    source and board was heard last before the stop, and first after it. `brakes` counts what the deadman sent, by
+    payload case, endpoint and reason of failure ("" if it was sent). `obeyed` tells which boards have shown that they
+    stopped.
     """
 
     at: int
@@ -96,6 +100,7 @@ class Stop:
             f"  last fed  {self._last_fed()}",
             *(f"  lost      {each}" for each in self.lost),
             *(f"  sent      {each}" for each in self._sent()),
+            *(f"  board     {self._board(each)}" for each in self.settings.brakes),
             *(f"  obeyed    {each}" for each in self.obeyed),
             f"  released  {self._release()}",
         ]
@@ -134,6 +139,18 @@ class Stop:
             }
         )
 
+    @property
+    def _topic(self) -> str:
+        """The topic of a gateway's clients whose deadman it is, or ""."""
+        return self.route.partition(":")[2]
+
+    def _board(self, name: str) -> str:
+        heard, _ = self.heard.get(name, (None, ""))
+        again = self.heard_again.get(name)
+        before = f"last heard {_length(self.at - heard)} before" if heard else "not heard before"
+        after = f"{_length(again - self.at)} after" if again else "not after"
+        return f"{name} was {before} the stop, and {after} it"
+
     def _what(self) -> str:
         braked = f" and braked {' and '.join(self.settings.brakes)}" if self.settings.brakes else ""
         since = f", {_length(self.at - self.fed.at)} after the last command" if self.fed else ""
@@ -142,6 +159,8 @@ class Stop:
     def _cause(self) -> tuple[str, str]:
         """Return the cause, and its remedy or ""."""
         sources, heard = self.settings.sources, self.heard
+        if self._topic:
+            return f"no client published on {self._topic}", "Check that the client runs and reaches the gateway."
         if self.lost:
             worst = max(self.lost, key=lambda each: each.count)
             silent = [self._silence(source) for source in sources if not worst.is_own and self._is_silent(source)]
@@ -177,6 +196,8 @@ class Stop:
     def _last_fed(self) -> str:
         if self.fed is None:
             return f"never since {_clock(self.begin)}, where the recording begins"
+        if self._topic:
+            return f"{_clock(self.fed.at)} by a client's message"
         source = f" from {self.fed.sender}" if self.fed.sender else ""
         return f"{_clock(self.fed.at)} by {self.fed.case}{source}: {self.fed.payload or 'no fields'}"
 
@@ -184,7 +205,7 @@ class Stop:
         return [
             f"{case or 'nothing'} to {endpoint}, {count} times" + (f", not sent: {problem}" if problem else "")
             for (case, endpoint, problem), count in self.brakes.items()
-        ] or ["nothing that is recorded"]
+        ] or [f"its message on {self._topic}, which is not recorded" if self._topic else "nothing that is recorded"]
 
     def _release(self) -> str:
         if self.released is None:
@@ -210,10 +231,12 @@ class Stops:
     """Finds the stops in the entries of a recording, taken in the order of time.
 
     `routes` are those of the table that ran. `has_actions`: the recording has what the router did by itself.
+    `silences`: endpoints that were heard again after a silence.
     """
 
     def __init__(self, routes: Mapping[str, RecordedRoute], wire: Wire) -> None:
         self.found: list[Stop] = []
+        self.silences: list[Action] = []
         self.has_actions = False
         self._routes = routes
         self._wire = wire
@@ -244,7 +267,7 @@ class Stops:
         sender, case = it.endpoint or it.peer[0], self._names.get(first_field(it.data), "")
         self._heard[sender] = it.at, it.peer[0]
         for state in self._states.values():
-            if (stop := state.stop) is not None and sender in stop.settings.sources:
+            if (stop := state.stop) is not None and sender in (*stop.settings.sources, *stop.settings.brakes):
                 stop.heard_again.setdefault(sender, it.at)
         if not it.reason:
             self._commands.setdefault(case, {})[sender] = it.at
@@ -255,11 +278,14 @@ class Stops:
                 state.tally("rejected", it.reason, case, sender, is_own=sender in route.sources).add(it.at)
 
     def _did(self, it: Action) -> None:
-        state = self._states.setdefault(it.route, _State()) if it.what == TRIPPED else self._states.get(it.route)
+        if it.what == RETURNED:
+            self.silences.append(it)
+            return
+        state = self._states.setdefault(it.route, _State()) if it.what in (TRIPPED, FED) else self._states.get(it.route)
         if state is None:
             return
-        if it.what == SENT:
-            state.fed = self._fed(it)
+        if it.what in (SENT, FED):
+            state.fed = self._fed(it) if it.what == SENT else Fed(it.at, "", "", "a client")
             state.lost = {}
         elif it.what == LOST:
             sender = f"topic {it.topic}" if it.topic else self._sender(it.route)
@@ -274,7 +300,7 @@ class Stops:
 
     def _tripped(self, it: Action, state: _State) -> None:
         settings, begin = self._routes.get(it.route, _UNKNOWN), self._begin or it.at
-        heard = {source: self._heard[source] for source in settings.sources if source in self._heard}
+        heard = {name: self._heard[name] for name in (*settings.sources, *settings.brakes) if name in self._heard}
         state.stop = Stop(it.at, it.route, settings, state.fed, begin, [*state.lost.values()], heard)
         self.found.append(state.stop)
 

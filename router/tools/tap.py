@@ -24,7 +24,7 @@ from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.observe.tap import Lost
-from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, MirroredDatagram
+from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.model import Expression
 from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
@@ -175,6 +175,10 @@ class ShownAction:
             return f"{deadman} tripped"
         if it.what == RELEASED:
             return f"{deadman} was released: a command was sent"
+        if it.what == FED:
+            return f"{deadman} was fed by a client's message"
+        if it.what == RETURNED:
+            return f"{it.target} was silent for {it.detail} and is back"
         source = f" from topic {it.topic}" if it.topic else ""
         if it.what == LOST:
             return f"not sent to {it.target} ({it.route}{source}): {self._why_not()}"
@@ -195,8 +199,8 @@ class ShownAction:
         """Return one JSON object."""
         del with_hex
         it = self.action
-        document: dict[str, object] = {"time": utc_text(self.at), "action": it.what, "route": it.route}
-        texts = {"endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
+        document: dict[str, object] = {"time": utc_text(self.at), "action": it.what}
+        texts = {"route": it.route, "endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
         document |= {key: text for key, text in texts.items() if text}
         if self.decoded is not None:
             document["case"] = self.decoded.case.name

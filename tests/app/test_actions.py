@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import socket
+import time
 from collections.abc import Sequence
 from contextlib import closing
 
@@ -11,8 +14,10 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.app import Router
 from router.recording.mirror import Acted, Action
-from tests.app.conftest import BRAKE, DRIVE, Site
+from tests.app.conftest import BRAKE, DRIVE, Site, udp
+from tests.app.test_client_deadmen import COMMAND, gateway
 from tests.app.test_from_ros import TYPE, UNHURRIED, command, drive
+from tests.ports import free_port
 from tests.ros.peers import Publisher, wait_until
 
 MANUAL = """\
@@ -56,6 +61,34 @@ def test_commands_that_feed_a_deadman_are_actions_and_all_that_it_does(site: Sit
     sent = braked._replace(what="sent", data=DRIVE)
     tripped, released = Action(0, "tripped", "manual_drive"), Action(0, "released", "manual_drive")
     assert seen == [sent, tripped, braked, released, sent, braked]  # the last one at the end
+
+
+def test_a_client_who_feeds_his_deadman_is_an_action(site: Site) -> None:
+    port = free_port(kind=socket.SOCK_STREAM)
+    with site.router(FORWARDED + gateway(port, timeout="150ms")) as router:
+        seen = watched(router)
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.sendall(COMMAND)
+            wait_until(lambda: len(seen) >= 2)
+    assert seen[:2] == [Action(0, "fed", "operator:/drive"), Action(0, "tripped", "operator:/drive")]
+
+
+def test_the_end_of_a_silence_is_an_action(site: Site) -> None:
+    endpoints = "  arm_board: {address: 127.0.0.40:8, kind: tool, stale_after: 250ms}\n"
+    route = FORWARDED.replace("sensor_board", "[sensor_board, arm_board]")
+    with udp("127.0.0.40") as board, Router(site.program(route, endpoints)) as router:
+        seen = watched(router)
+
+        def is_back() -> bool:
+            """Send for a while, and again after a silence."""
+            for pause in [0.005] * 60 + [0.2, 0.1]:
+                board.sendto(PH, ("127.0.0.1", site.listen))
+                time.sleep(pause)
+            return bool(seen)
+
+        wait_until(is_back)
+    assert (seen[0].what, seen[0].target, seen[0].route) == ("returned", "arm_board", "")
+    assert re.fullmatch(r"0\.[1-9] s", seen[0].detail)
 
 
 @pytest.mark.parametrize("table", [drive(), UNHURRIED], ids=["urgent", "unhurried"])

@@ -19,7 +19,7 @@ from router.errors import UsageError
 from router.recording.about import RecordedRoute
 from router.recording.channels import Channels
 from router.recording.encoder import Encoder
-from router.recording.mirror import BRAKED, LOST, RELEASED, SENT, TRIPPED, Action, MirroredDatagram
+from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.recording.reader import Recording
 from router.recording.writer import RecordingFile
 from router.tools.show import in_order, window
@@ -199,6 +199,7 @@ def test_a_lost_link_is_the_cause_when_the_sender_is_silent(tmp_path: Path, caps
         f"  remedy    {CHECK}",
         "  last fed  16:02:31.001 by manual_drive from basestation: forward_backward=5",
         "  sent      manual_brake to driving_board, 3 times",
+        "  board     driving_board was not heard before the stop, and not after it",
         "  released  16:02:33.802, after 2.30 s",
     ]
 
@@ -251,6 +252,44 @@ def test_a_topic_without_messages_is_the_cause(tmp_path: Path, capsys: pytest.Ca
     lines = explained(capsys, recording(tmp_path, got(0, IMU, "sensor_board"), fed, *stopped(0.7, "drive_motor")))
     assert lines[1] == "  cause     no message arrived on cmd"
     assert "  last fed  16:02:30.200 by drive_motor from topic cmd: (all default)" in lines
+
+
+def test_a_board_that_was_silent_is_told_with_and_without_a_stop(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    back = Action(at(2.4), RETURNED, "", "driving_board", detail="2.3 s")
+    path = recording(
+        tmp_path, got(0.1, IMU, "driving_board"), *driven(0.2), *stopped(0.701), got(2.4, IMU, "driving_board"), back
+    )
+    lines = explained(capsys, path)
+    assert "  board     driving_board was last heard 601 ms before the stop, and 1.70 s after it" in lines
+    assert lines[-1] == "16:02:32.400+0200 driving_board was silent for 2.3 s and is back"
+    (calm := tmp_path / "calm").mkdir()
+    path = recording(calm, back)
+    assert explained(capsys, path) == lines[-1:]
+    [line] = said(capsys, path, "--why", "--json")
+    assert json.loads(line) == {
+        "time": "2026-04-12T14:02:32.400000+00:00",
+        "action": "returned",
+        "endpoint": "driving_board",
+        "detail": "2.3 s",
+    }
+
+
+def test_the_deadman_of_a_gateways_client_tells_when_a_client_fed_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    route = "dashboard:/cmd_vel"
+    path = recording(tmp_path, *(did(0.1 * turn, FED, route) for turn in range(3)), did(0.7, TRIPPED, route))
+    assert explained(capsys, path) == [
+        f"16:02:30.700 the deadman of {route} tripped, 500 ms after the last command",
+        "  cause     no client published on /cmd_vel",
+        "  remedy    Check that the client runs and reaches the gateway.",
+        "  last fed  16:02:30.200 by a client's message",
+        "  sent      its message on /cmd_vel, which is not recorded",
+        "  released  not in this recording",
+    ]
+    assert said(capsys, path)[0] == f"16:02:30.000+0200 the deadman of {route} was fed by a client's message"
 
 
 def test_only_the_stops_around_a_time_are_explained_and_their_absence_is_said(

@@ -1,5 +1,5 @@
 /* The actions of the router, for observers: the commands that it sends, the datagrams of deadmen, messages lost on the way to
- * an endpoint, and changes of deadmen. Received datagrams have a ring of their own (carrier.h), so a flood of them displaces
+ * an endpoint, changes of deadmen, and the ends of silences. Received datagrams have a ring of their own (carrier.h), so a flood of them displaces
  * no action.
  *
  * While nobody observes, an action costs one load. Any thread may note one; the lock is held only to copy a record. */
@@ -19,14 +19,16 @@ enum action {
     ACTION_BRAKED,  /* a datagram of a deadman; `error` is 0 if it was sent */
     ACTION_LOST,    /* a message for an endpoint, with `reason` and `refusal`; a text with details may follow */
     ACTION_TRIPPED, /* a deadman */
-    ACTION_RELEASED
+    ACTION_RELEASED,
+    ACTION_FED,     /* a deadman, by a message of a gateway's client */
+    ACTION_RETURNED /* an endpoint is heard again after a silence, whose ns (int64_t) follow */
 };
 
-/* Up to MAX_DATAGRAM bytes follow: the datagram that was sent, or a text. */
+/* Up to MAX_DATAGRAM bytes follow: the datagram that was sent, a text or a number. */
 struct action_record {
     uint32_t size, action; /* enum action */
     int64_t at;            /* wall clock */
-    uint32_t route, target; /* as in events; `target` is NO_NAME if a deadman changes */
+    uint32_t route, target; /* as in events; NO_NAME if an endpoint returns, or if a deadman is fed or changes */
     uint32_t topic;         /* that the message came from, or NO_NAME */
     uint32_t reason;        /* enum loss */
     int32_t error;          /* errno, or 0 */

@@ -572,6 +572,7 @@ void command_has_left(struct timers *timers, const struct feed *feeds, uint32_t 
 void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now) {
     struct feed feed = {.deadman = deadman, .to = bit(0)};
     pthread_mutex_lock(&timers->lock);
+    note(timers, ACTION_FED, deadman);
     command_has_left(timers, &feed, 1, 0, now);
     pthread_mutex_unlock(&timers->lock);
 }

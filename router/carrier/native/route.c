@@ -184,6 +184,9 @@ static void end_silence(struct routing *routing, const struct received *received
     if (!before || before - heard_since < silence) return;
     stage_count(&routing->stage, peer->silences, 1);
     counter_set(counters, peer->last_silence, silence);
+    struct actions *observed = stage_actions(&routing->stage);
+    struct action_record action = {.action = ACTION_RETURNED, .route = NO_NAME, .target = peer->id, .topic = NO_NAME};
+    if (observed) actions_note(observed, counters, action, &silence, sizeof silence);
     struct returned_event event = {.kind = EVENT_RETURNED, .endpoint = peer->id, .silence = silence};
     if (may_report(&routing->stage.reporter, received->now))
         put_event(routing->stage.reporter.events, &event, sizeof event, "");
