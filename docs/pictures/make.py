@@ -150,7 +150,7 @@ class Rover:
 
     def look(self) -> View:
         self._window.add(metrics(self.url))
-        return view(*self._window.ends, health(self.url).problems, time.time())
+        return view(*self._window.ends, health(self.url).problems)
 
     def until(self, holds: Callable[[View], bool], what: str, patience: float = PATIENCE) -> View:
         limit = time.monotonic() + patience
@@ -205,7 +205,7 @@ def _take_all(folder: Path, running: Rover, browser: Browser, settled: float) ->
     gateway.call("Page.navigate", url=f"{running.gateway}?{query}")
     time.sleep(settled)
     top = running.until(_is_well, "everything is well")
-    _write_terminal(folder / "top.svg", Screen(top, f"router top {running.url}", Order.TABLE, TERMINAL[1]))
+    _write_terminal(folder / "top.svg", Screen(top, f"{TABLE.name} at {running.url}", Order.TABLE, TERMINAL[1]))
 
     said = _expect(desktop, wanted=WELL, unwanted=UNWELL)
     _expect(phone, wanted=WELL, unwanted=UNWELL)
