@@ -165,7 +165,7 @@ def test_the_packet_that_is_taken_apart_is_one_of_the_gateway() -> None:
 def test_schema_and_documents_are_as_they_are_shown() -> None:
     assert VECTOR is not None
     schema, sent, received = examples(PROTOCOL, "json")
-    assert json.loads(schema) == json.loads(schema_text(VECTOR))
+    assert json.loads(schema) == json.loads(schema_text(VECTOR, Style.WRAPPED))
     data = next(line for line in map(json.loads, sent.splitlines()) if line["op"] == "data")
     cdr = decoder(VECTOR, Style.PLAIN)(json.dumps(data["data"]).encode())
     assert json.loads(encoder(VECTOR, Style.PLAIN)(cdr)) == data["data"]
@@ -195,7 +195,7 @@ def test_the_client_shows_data_whose_schema_it_has(tmp_path: Path) -> None:
     assert VECTOR is not None
     port = free_port()
     plain = vector_packet(x=1.0, y=0.1, z=-2.5)
-    schema = plain._replace(payload=schema_text(VECTOR).encode())
+    schema = plain._replace(payload=schema_text(VECTOR, Style.WRAPPED).encode())
     compressed = plain._replace(is_compressed=True, payload=compress(plain.payload, 3))
     early = plain._replace(topic="/early", type_name="geometry_msgs/msg/Point")
     packets = [pack(packet) for packet in (early, schema, plain, compressed)]

@@ -20,7 +20,7 @@ import msgspec
 import orjson
 
 from router.gateway.json_codec import reader, shown
-from router.gateway.json_types import example, schema_text
+from router.gateway.json_types import Style, example, schema_text
 from router.gateway.packets import PacketError
 from router.types.model import MessageType
 
@@ -64,7 +64,12 @@ def topics_document(time: float, rates: Iterable[tuple[str, str, float]]) -> byt
 def inbound_document(types: Mapping[str, MessageType]) -> bytes:
     """Make a document of the topics that clients may publish on, with their types."""
     topics = [
-        {"topic": topic, "type": type_.name, "schema": orjson.Fragment(schema_text(type_)), "example": example(type_)}
+        {
+            "topic": topic,
+            "type": type_.name,
+            "schema": orjson.Fragment(schema_text(type_, Style.PLAIN)),
+            "example": example(type_),
+        }
         for topic, type_ in types.items()
     ]
     return orjson.dumps({"op": "inbound", "topics": topics})

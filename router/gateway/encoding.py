@@ -21,12 +21,12 @@ LARGE = 64 << 10
 
 
 class ReadyType:
-    """A message type ready to be received: its definition, its rclpy class, its JSON schema."""
+    """A message type ready to be received: its definition, its rclpy class, its JSON schemas."""
 
     def __init__(self, message: MessageType, message_class: Any) -> None:
         self.message = message
         self.message_class = message_class
-        self.schema = schema_text(message)
+        self.schemas = {style: schema_text(message, style) for style in Style}
         self._encoders: dict[Style, Encode] = {}
 
     def text(self, style: Style, cdr: bytes) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import json
 import math
+from collections import defaultdict
 from typing import Any
 
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
@@ -22,25 +23,52 @@ class Style(enum.Enum):
     """Single values are bare; a wstring is a string."""
 
 
-def schema_text(message: MessageType) -> str:
-    """Return the JSON schema of a type as the C++ gateway writes it: nested types inline, fields in declared order."""
-    return json.dumps(_schema(message), separators=(",", ":"), sort_keys=True)
+def schema_text(message: MessageType, style: Style) -> str:
+    """Return the JSON schema of a type: nested types inline, fields in declared order.
+
+    In the wrapped style it is as the C++ gateway writes it; in the plain style it also has names of values.
+    """
+    return json.dumps(_schema(message, style), separators=(",", ":"), sort_keys=True)
 
 
-def _schema(message: MessageType) -> dict[str, object]:
+def _schema(message: MessageType, style: Style) -> dict[str, object]:
     package, _, name = message.name.rpartition("/")
-    fields = message.fields or (PLACEHOLDER,)
-    return {"name": name, "namespace": package.replace("/", "::"), "fields": [_field_schema(field) for field in fields]}
+    names = _value_names(message) if style is Style.PLAIN else {}
+    fields = [_field_schema(field, style, names.get(field.name)) for field in message.fields or (PLACEHOLDER,)]
+    return {"name": name, "namespace": package.replace("/", "::"), "fields": fields}
 
 
-def _field_schema(field: Field) -> dict[str, object]:
+def _value_names(message: MessageType) -> dict[str, dict[str, str]]:
+    """Return by field the names of its values, as far as the constants of the message tell them without doubt.
+
+    ROS does not say which field a constant is for. By convention, its name begins with that of the field; if none does,
+    a single integer field has them all. A value with two names has none.
+    """
+    integers = [field.name for field in message.fields if isinstance(field.type, Int)]
+    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    constants = {name: value for name, value in message.constants.items() if type(value) is int}
+    for name, value in constants.items():
+        owner = max((each for each in integers if name.startswith(f"{each.upper()}_")), key=len, default="")
+        if owner:
+            found[owner][str(value)].append(name[len(owner) + 1 :])
+    if not found and len(integers) == 1:
+        for name, value in constants.items():
+            found[integers[0]][str(value)].append(name)
+    return {
+        field: {value: name for value, (name, *others) in values.items() if not others}
+        for field, values in found.items()
+    }
+
+
+def _field_schema(field: Field, style: Style, names: dict[str, str] | None) -> dict[str, object]:
     is_array = isinstance(field.type, List)
     element = field.type.element if isinstance(field.type, List) else field.type
     return {
         "name": field.name,
         "is_array": is_array,
         "type": _type_name(element),
-        "subtype": _schema(element) if isinstance(element, MessageType) else "primitive",
+        "subtype": _schema(element, style) if isinstance(element, MessageType) else "primitive",
+        **({"names": names} if names else {}),
     }
 
 

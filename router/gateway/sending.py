@@ -245,7 +245,10 @@ class TopicSender:
     def schema(self, served: ServedTopic) -> Frame:
         subscription = served.subscription
         data = self._encoding.schema(
-            subscription.topic, subscription.type_name, subscription.schema, self._context.wall_s()
+            subscription.topic,
+            subscription.type_name,
+            subscription.schemas[self._encoding.style],
+            self._context.wall_s(),
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 

@@ -51,7 +51,7 @@ class TopicSubscription:
     ) -> None:
         self.topic = topic
         self.type_name = ready.message.name
-        self.schema = ready.schema
+        self.schemas = ready.schemas
         self._type = ready
         self._topics = topics
         self._loop = loop

@@ -16,12 +16,13 @@ from router.gateway.documents import (
     schema_document,
     topics_document,
 )
-from router.gateway.json_types import schema_text
+from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import PacketError
-from router.types.model import Field, Float, MessageType, String
+from router.types.model import Field, Float, Int, MessageType, String, Type
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 TYPE = MessageType("p/msg/T", (Field("x", Float(64)),))
+SCHEMA = json.loads(schema_text(TYPE, Style.PLAIN))
 TIMES = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -40,6 +41,37 @@ def test_the_text_of_a_message_stands_in_its_document_as_it_is() -> None:
     )
 
 
+UINT8, FLOAT = Int(8, signed=False), Float(64)
+
+
+@pytest.mark.parametrize(
+    ("fields", "constants", "names"),
+    [
+        (
+            {"power": UINT8, "power_status": UINT8},
+            {"POWER_STATUS_FULL": 4, "POWER_ON": 1, "OTHER": 4, "POWER_NAME": "x"},
+            {"power": {"1": "ON"}, "power_status": {"4": "FULL"}},
+        ),
+        (
+            {"kind": UINT8, "range": FLOAT},
+            {"ULTRASOUND": 0, "INFRARED": 1},
+            {"kind": {"0": "ULTRASOUND", "1": "INFRARED"}},
+        ),
+        ({"kind": UINT8}, {"ON": 1, "OPEN": 1, "OFF": 0}, {"kind": {"0": "OFF"}}),
+        ({"offset": UINT8, "datatype": UINT8}, {"INT8": 1, "UINT8": 2}, {}),
+        ({"range": FLOAT}, {"RANGE_MOST": 1}, {}),
+    ],
+    ids=["prefix", "only integer", "two names", "in doubt", "no integer"],
+)
+def test_values_have_the_names_of_constants_where_these_are_without_doubt(
+    fields: dict[str, Type], constants: dict[str, object], names: dict[str, dict[str, str]]
+) -> None:
+    declared = MessageType("p/msg/T", tuple(Field(name, kind) for name, kind in fields.items()), constants)
+    found = json.loads(schema_text(declared, Style.PLAIN))["fields"]
+    assert {each["name"]: each["names"] for each in found if "names" in each} == names
+    assert "names" not in schema_text(declared, Style.WRAPPED)
+
+
 def test_topics_inbound_and_refusals_are_documents_too() -> None:
     assert json.loads(topics_document(2.5, [("/t", "p/msg/T", 49.5)])) == {
         "op": "topics",
@@ -48,7 +80,14 @@ def test_topics_inbound_and_refusals_are_documents_too() -> None:
     }
     assert json.loads(inbound_document({"/t": TYPE})) == {
         "op": "inbound",
-        "topics": [{"topic": "/t", "type": "p/msg/T", "schema": json.loads(schema_text(TYPE)), "example": {"x": 0.0}}],
+        "topics": [
+            {
+                "topic": "/t",
+                "type": "p/msg/T",
+                "schema": json.loads(schema_text(TYPE, Style.PLAIN)),
+                "example": {"x": 0.0},
+            }
+        ],
     }
     assert json.loads(rejected_document("invalid", "no 'x'\n", "/t")) == {
         "op": "rejected",

@@ -77,7 +77,7 @@ def test_schema_packets_are_those_of_the_existing_gateway(interfaces: RosInterfa
     described = [golden for golden in GOLDEN if "schema" in golden]
     assert described
     for golden in described:
-        assert packed(golden, schema_text(declared(interfaces, golden)).encode()) == golden["schema"]
+        assert packed(golden, schema_text(declared(interfaces, golden), Style.WRAPPED).encode()) == golden["schema"]
 
 
 def test_packets_that_the_existing_gateway_compressed_are_read() -> None:

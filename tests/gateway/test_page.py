@@ -212,6 +212,17 @@ def test_fields_are_in_the_order_of_the_message(gateway: FakeGateway, page: Page
     page.until(f"{row('/imu')}.querySelector('.preview').textContent.startsWith('orientation: {{x: 0, y: 0')")
 
 
+def test_a_value_has_the_name_of_its_constant(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/battery", {"status": 4, "cells": [{"health": 1}, {"health": 9}], "constructor": 4})
+    choose(page, "/battery")
+    cell = schema("Cell", field("health", "uint8") | {"names": {"1": "GOOD"}})
+    status = field("status", "uint8") | {"names": {"4": "<b>FULL</b>"}}
+    battery = schema("Battery", status, field("cells", cell, is_array=True), field("constructor", "uint8"))
+    gateway.say({"op": "schema", "type": "sensor_msgs/msg/Imu", "time": 1.0, "schema": battery})
+    numbers = "[...document.querySelectorAll('#tree .number')].map((each) => each.textContent).join()"
+    page.until(f"{numbers} === '4 (<b>FULL</b>),1 (GOOD),9,4'")
+
+
 def test_on_a_wide_screen_the_first_topic_with_a_rate_is_open(gateway: FakeGateway, page: Page) -> None:
     show_at(page, PHONE)
     gateway.rows = [{"topic": f"/{name}", "type": "a/msg/B", "rate": 5 * (name != "a")} for name in "abc"]

@@ -52,8 +52,11 @@ def imu(**fields: Any) -> bytes:
 
 @pytest.mark.parametrize(
     "shared",
-    [r"^const \$ = [^\n]*$", *(rf"^function {name}\(.*?^}}$" for name in ("make", "setText", "rulerOf"))],
-    ids=["$", "make", "setText", "rulerOf"],
+    [
+        r"^const \$ = [^\n]*$",
+        *(rf"^function {name}\(.*?^}}$" for name in ("make", "setText", "rulerOf", "sharedStart", "shortened")),
+    ],
+    ids=["$", "make", "setText", "rulerOf", "sharedStart", "shortened"],
 )
 def test_what_both_pages_have_is_the_same_in_both(shared: str) -> None:
     """Each page is one file, so that it needs nothing else; what they share must not drift apart."""
