@@ -157,6 +157,19 @@ def test_types_and_names_are_not_cut(gateway: FakeGateway, page: Page) -> None:
         page.until(f"{cell}?.textContent === '{long}' && {cell}.scrollWidth <= {cell}.clientWidth")
 
 
+def test_names_that_do_not_fit_lose_the_namespace_of_most_and_differ(gateway: FakeGateway, page: Page) -> None:
+    names = [f"/expedition/science_payload/{unit}_of_the_secondary_rover/filtered" for unit in ("imu", "gps", "arm")]
+    shown = "[...document.querySelectorAll('tbody .name')].map((each) => each.textContent)"
+    gateway.list_topics([*names, "/rosout"])
+    for size in (PHONE, (1366, 768)):
+        show_at(page, size)
+        page.until(f"{shown}.length === 4 && {shown}.filter((name) => name.startsWith('…/')).length === 3")
+        assert len(set(page.evaluate(shown))) == 4
+        assert "/rosout" in page.evaluate(shown)
+    page.evaluate("document.querySelector('tbody').style.fontSize = '4px'; fitNames()")
+    assert page.evaluate(shown) == sorted([*names, "/rosout"])
+
+
 def test_long_names_lose_their_middle_and_leave_room_for_values(gateway: FakeGateway, page: Page) -> None:
     names = [
         f"/vehicle/{side}_wheel_module/suspension_actuator_temperature/raw_measurement" for side in ("left", "right")
