@@ -79,8 +79,8 @@ class CountersCollector(Collector):
                 yield from _histogram(name, labels, metric.bounds, cells)
         else:
             for labels, index in self._indexes[metric.name]:
-                if (value := _value(metric.kind, [thread[index] for thread in threads], now)) is not None:
-                    yield Sample(name + suffix, labels, value)
+                if (found := _value(metric.kind, [thread[index] for thread in threads], now)) is not None:
+                    yield Sample(name + suffix, labels, found)
 
 
 def _value(kind: str, counts: Sequence[int], now: int) -> float | None:

@@ -71,15 +71,20 @@ class Reporter:
             self._remember(report.mismatch)
         if report.kind == "drop":
             self._lost[report.place, report.target] = boottime_ns(), report
-        error = self._text(report.error, report.target) if report.error is not None else ""
         where = "listener" if report.kind in ("reject", "supersede") else "route"
-        values = {where: report.place, "target": report.target, "reason": report.reason, "error": error}
+        values: dict[str, Any] = {
+            where: report.place,
+            "target": report.target,
+            "reason": report.reason,
+            "error": self._text(report.error, report.target) if report.error is not None else "",
+            "detail": report.detail,
+        }
         self._floods.note(
             (report.kind, report.place, report.target, report.reason),
             logger.warning,
             _EVENTS[report.kind],
             times=report.times,
-            **{key: value for key, value in {**values, "detail": report.detail}.items() if value},
+            **{key: value for key, value in values.items() if value},
         )
 
     def _text(self, error: BaseException, target: str) -> str:
