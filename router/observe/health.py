@@ -29,6 +29,7 @@ from router.compiler.metrics import (
 from router.observe.bursts import Burst
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
+from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.table.model import ANY, EndpointKind
 from router.values import age_text
@@ -115,9 +116,6 @@ _NO_LOSS = {*INTENDED_REASONS, "unhandled"}
 _ALSO_LOST = "mirror_dropped", "recordings_lost"
 """Further metrics of RECORDING_INCOMPLETE."""
 
-_NAMED = 3
-"""Maximum routes that a text names."""
-
 _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
     "`router tap --only rejected` shows what it sends."
@@ -196,7 +194,7 @@ class Look:
         Their deadman has been sending for a long time, reaches its endpoints, no command is dropped or rejected, and
         no sender of commands is out of reach.
         """
-        rejected = {each.payload_case for each in self.mismatches if self._expected(each)}
+        rejected = {each.payload_case for each in self.mismatches if self._senders.expected(each)}
         lost = self._stale & self._unsent.keys()
         failing = {route.name for route in self.program.table.routes if route.case.value in rejected}
         failing |= {route for route, names in self._sources.items() if names & lost}
@@ -217,14 +215,19 @@ class Look:
         away = {
             name
             for name in self._stale - self._unsent.keys()
-            if endpoints[name].kind is not EndpointKind.BOARD and self.was_heard(name) and not self._in_place_of(name)
+            if endpoints[name].kind is not EndpointKind.BOARD
+            and self.was_heard(name)
+            and not self._senders.in_place_of(name)
         }
         return {route: sorted(away & self._sources.get(route, set())) for route in sorted(self.halted)}
 
     @cached_property
+    def _senders(self) -> Senders:
+        return Senders(self.program, self.mismatches)
+
+    @property
     def _sources(self) -> Mapping[str, set[str]]:
-        """The endpoints that each route accepts messages from."""
-        return {route.name: {source.value for source in route.sources} for route in self.program.table.routes}
+        return self._senders.sources
 
     @cached_property
     def _limits(self) -> Mapping[str, float]:
@@ -270,14 +273,14 @@ class Look:
                     more += f", and does not answer: {self._amount(lost)} for it lost in {self._span}"
             routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
             problem = self._problem(kind, {"endpoint": name}, more, routes)
-            if (sender := self._in_place_of(name)) is not None:
+            if (sender := self._senders.in_place_of(name)) is not None:
                 labels = {"endpoint": name, "sender": sender}
                 problem = problem._replace(labels=labels, more=f"{more}, while {sender} sends its messages")
             yield problem._replace(remedy=self._remedy_for_silence(name))
 
     def _remedy_for_silence(self, endpoint: str) -> str:
-        address = self._host(endpoint)
-        if (sender := self._in_place_of(endpoint)) is not None:
+        address = self._senders.host(endpoint)
+        if (sender := self._senders.in_place_of(endpoint)) is not None:
             return _OTHER_ADDRESS.format(endpoint=endpoint, address=address, sender=sender)
         if len(self._stale) == len(self._limits) > 1:
             return _ALL_SILENT
@@ -290,8 +293,10 @@ class Look:
     def _amount(self, counts: Counter[str]) -> str:
         """Return a number of losses with the routes that have most of them."""
         routes = [route for route, _ in counts.most_common() if route]
-        of = f" of {', '.join(routes[:_NAMED])}" if routes else ""
-        return f"{counts.total()}{of}" + (f" and {len(routes) - _NAMED} more routes" if len(routes) > _NAMED else "")
+        of = f" of {', '.join(routes[:MOST_NAMED])}" if routes else ""
+        return f"{counts.total()}{of}" + (
+            f" and {len(routes) - MOST_NAMED} more routes" if len(routes) > MOST_NAMED else ""
+        )
 
     def _returned(self) -> Iterator[Problem]:
         """Yield endpoints that were silent a while ago."""
@@ -300,50 +305,6 @@ class Look:
                 silence = self.now.of("endpoint_last_silence_seconds", name).get((), 0.0)
                 more = f": for {silence:.1f} s, until {age_text(ago)} ago"
                 yield self._problem(Kind.ENDPOINT_RETURNED, {"endpoint": name}, more)
-
-    def _expected(self, mismatch: Mismatch) -> list[str]:
-        """Return the endpoints that routes accept this payload case from."""
-        routes = (route for route in self.program.table.routes if route.case.value == mismatch.payload_case)
-        return list(dict.fromkeys(name for route in routes for name in sorted(self._sources[route.name] - {ANY})))
-
-    def _host(self, endpoint: str) -> str:
-        return self.program.table.endpoints[endpoint].address.value.host
-
-    def _in_place_of(self, endpoint: str) -> str | None:
-        """Return another host that sends messages expected only from this endpoint."""
-        hosts = (each.host for each in sorted(self.mismatches) if self._expected(each) == [endpoint])
-        return next((host for host in hosts if host != self._host(endpoint)), None)
-
-    def _name_of(self, host: str) -> str:
-        """Return the host with the name of its endpoint, if it has one."""
-        found = (name for name in self.program.table.endpoints if self._host(name) == host)
-        return next((f"{name} ({host})" for name in found), host)
-
-    def _senders(self, payload_case: str) -> list[str]:
-        """Return who has recently sent messages of this case, which no route accepts from them."""
-        return [self._name_of(each.host) for each in sorted(self.mismatches) if each.payload_case == payload_case]
-
-    def _mismatched(self, listener: str) -> tuple[str, tuple[str, ...]]:
-        """Describe who sends messages expected from others to a listener; also return the routes that reject them."""
-        found = sorted(each for each in self.mismatches if each.listener == listener and self._expected(each))
-        sentences: dict[str, None] = {}
-        for each in found:
-            who = self._name_of(each.host)
-            expected = self._expected(each)
-            if each.host in map(self._host, expected):
-                sentences[f"{who} uses another port or listener than the table says"] = None
-            else:
-                others = " or ".join(f"{name} ({self._host(name)})" for name in expected)
-                sentences[f"{who} sends messages expected from {others}"] = None
-        cases = {each.payload_case for each in found}
-        routes = tuple(route.name for route in self.program.table.routes if route.case.value in cases)
-        return _few([*sentences]), routes
-
-    def _unknown(self, listener: str) -> str:
-        """Describe who sends payloads to a listener that the envelope does not have."""
-        known = self.program.envelope.cases
-        found = sorted(each for each in self.mismatches if each.listener == listener and each.payload_case not in known)
-        return _few([f"{self._name_of(each.host)} sends {each.payload_case}" for each in found])
 
     def _tripped(self) -> Iterator[Problem]:
         """Yield the deadmen that send in place of commands, with the cause."""
@@ -361,7 +322,7 @@ class Look:
         """Return why commands of a route do not get through, and the remedy, as far as they are known."""
         sources = self._sources.get(route, set()) - {ANY}
         for name in sorted(sources):
-            if (sender := self._in_place_of(name)) is not None:
+            if (sender := self._senders.in_place_of(name)) is not None:
                 return f", while {sender} sends those of {name}", self._remedy_for_silence(name)
         if sources and sources <= self._stale:
             names = sorted(sources)
@@ -471,10 +432,10 @@ class Look:
         if kind is Kind.UNHANDLED_CASE:
             return self._unhandled(labels, more)
         if reason == "source_mismatch" and labels["listener"] not in self.program.table.gateways:
-            who, routes = self._mismatched(labels["listener"])
+            who, routes = self._senders.mismatched(labels["listener"])
             more += f": {who}" if who else ""
         elif reason == "unknown_case":
-            more += f": {who}" if (who := self._unknown(labels["listener"])) else ""
+            more += f": {who}" if (who := self._senders.unknown(labels["listener"])) else ""
         problem = self._problem(kind, labels, more, routes)
         if (target := labels.get("target", "")) in self._stale and reason in UNSENT_REASONS:
             more += f": {target} has not been heard since the router started"
@@ -491,8 +452,8 @@ class Look:
         topics = list(dict.fromkeys(topic.topic.value for route in routes for topic in route.source_topics))
         if topics:
             more += f": it is accepted only from {'topic' if len(topics) == 1 else 'topics'} {' and '.join(topics)}"
-        if senders := self._senders(case):
-            more += f"{'; ' if topics else ': '}{_few(senders)} sent it"
+        if senders := self._senders.of(case):
+            more += f"{'; ' if topics else ': '}{few(senders)} sent it"
         problem = self._problem(Kind.UNHANDLED_CASE, labels, more, tuple(route.name for route in routes))
         return problem._replace(remedy=_FROM_TOPIC.format_map(labels)) if topics else problem
 
@@ -525,7 +486,3 @@ class Look:
             address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
         remedy = kind.remedy or REMEDIES.get(labels.get("reason") or labels.get("state", ""), "")
         return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)
-
-
-def _few(texts: Sequence[str]) -> str:
-    return "; ".join(texts[:_NAMED]) + (f"; and {len(texts) - _NAMED} more" if len(texts) > _NAMED else "")
