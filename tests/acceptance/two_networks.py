@@ -67,7 +67,7 @@ class Rover:
         return self.count("datagrams_rejected_total", listener=listener, reason="source_mismatch")
 
     def seen(self, endpoint: str) -> bool:
-        return self.count("endpoint_silence_seconds", endpoint=endpoint) > 0
+        return key("endpoint_silence_seconds", endpoint=endpoint) in self.samples()
 
 
 def udp(computer: Computer, address: tuple[str, int]) -> socket.socket:
