@@ -45,11 +45,21 @@ async def test_lines_go_both_ways_and_several_clients_get_the_same() -> None:
 
 
 @asynchronous
+async def test_blank_lines_are_no_messages() -> None:
+    async with served("lines") as (transport, events):
+        peer = await join("lines", transport)
+        await peer.send(b'\n\r\n \t\r\n{"op":1}\r\n\r\n\n  {"op":2} \n\n')
+        await until(lambda: len(events.said) == 2)
+        assert events.said == [b'{"op":1}', b'{"op":2}']
+        peer.leave()
+
+
+@asynchronous
 async def test_one_that_sends_without_end_does_not_keep_others_waiting() -> None:
     async with served("lines") as (transport, events):
         flood, other = [await join("lines", transport) for _ in range(2)]
         await until(lambda: len(events.clients) == 2)
-        flood.writer.write(b"\n" * 20 * PER_TURN)
+        flood.writer.write(b"x\n" * 20 * PER_TURN)
         other.writer.write(b"me too\n")
         await until(lambda: b"me too" in events.said)
         await until(lambda: len(events.said) == 20 * PER_TURN + 1)
@@ -57,7 +67,7 @@ async def test_one_that_sends_without_end_does_not_keep_others_waiting() -> None
         other.leave()
 
 
-MESSAGES = st.lists(st.binary(max_size=20).map(lambda message: message.replace(b"\n", b" ").rstrip(b"\r")), max_size=10)
+MESSAGES = st.lists(st.binary(max_size=20).map(lambda message: b"{" + message.replace(b"\n", b" ") + b"}"), max_size=10)
 
 
 @given(MESSAGES, st.lists(st.integers(1, 30), min_size=1), st.sampled_from(["packets", "lines"]))

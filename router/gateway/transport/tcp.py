@@ -15,6 +15,8 @@ from router.table.addresses import Address
 LENGTH = struct.Struct("<I")
 """Precedes each packet."""
 
+JSON_WHITESPACE = b" \t\r\n"
+
 
 class TooLongError(ValueError):
     """A packet or line exceeds the limit."""
@@ -79,7 +81,8 @@ class TcpTransport(StreamTransport):
                 client.unfinished_since = None
                 if not client.can_write():  # it was closed: discard what it sent before
                     return
-                self.events.received(client, data, self.clock.stamp())
+                if data or self._prefixed:  # a blank line is no message
+                    self.events.received(client, data, self.clock.stamp())
             await asyncio.sleep(0)
 
     async def _read_packet(self, reader: asyncio.StreamReader, first: bytes) -> bytes:
@@ -95,4 +98,4 @@ class TcpTransport(StreamTransport):
             line = first + await reader.readuntil(b"\n")
         except asyncio.LimitOverrunError:
             raise TooLongError(f"a line exceeds the limit of {self.limits.message} bytes") from None
-        return line[:-1].removesuffix(b"\r")
+        return line.strip(JSON_WHITESPACE)
