@@ -81,6 +81,25 @@ def cable(one: Computer, end: str, address: str, other: Computer, other_end: str
         computer.ip("link", "set", name, "up")
 
 
+@contextmanager
+def narrow_path() -> Iterator[tuple[Computer, Computer]]:
+    """The computers 10.78.1.1 and 10.78.2.2; a router between them has a smaller MTU (1280) on the second's side.
+
+    The router's ICMP messages are filtered, so the first computer does not learn of that MTU.
+    """
+    with computers("near", "between", "far") as (near, between, far):
+        cable(near, "eth0", "10.78.1.1/24", between, "wide", "10.78.1.2/24")
+        cable(between, "narrow", "10.78.2.1/24", far, "eth0", "10.78.2.2/24")
+        for computer, interface in ((between, "narrow"), (far, "eth0")):
+            computer.ip("link", "set", interface, "mtu", 1280)
+        between.run("sysctl", "-qw", "net.ipv4.ip_forward=1")
+        between.nft("add table ip filter; add chain ip filter output { type filter hook output priority 0; }")
+        between.nft("add rule ip filter output icmp type destination-unreachable drop")
+        near.ip("route", "add", "default", "via", "10.78.1.2")
+        far.ip("route", "add", "default", "via", "10.78.2.1")
+        yield near, far
+
+
 def _run(*command: object, check: bool = True) -> str:
     finished = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, timeout=60)
     assert not check or finished.returncode == 0, f"{command}\n{finished.stdout}{finished.stderr}"

@@ -27,6 +27,8 @@ SO_TIMESTAMP = 29
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_MEMINFO = 55
+IP_MTU_DISCOVER = 10
+IP_PMTUDISC_DONT = 0
 IP_RECVERR = 11
 IP_FREEBIND = 15
 SIOCGSTAMPNS = 0x8907
@@ -148,6 +150,14 @@ def bound_interface(opened: socket.socket) -> str | None:
 def report_sending_errors(opened: socket.socket) -> None:
     """Have the kernel report ICMP errors about datagrams sent from the socket's port."""
     opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
+
+
+def allow_fragments(opened: socket.socket) -> None:
+    """Clear "don't fragment" in the datagrams that a socket sends.
+
+    By default Linux sets it, and learns a path's MTU from ICMP errors. Where those are filtered, larger datagrams vanish.
+    """
+    opened.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, IP_PMTUDISC_DONT)
 
 
 def refuse_input(opened: socket.socket) -> None:

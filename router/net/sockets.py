@@ -14,6 +14,7 @@ from functools import cache
 
 from router.net.kernel import (
     IP_FREEBIND,
+    allow_fragments,
     ask_for_receive_buffer,
     bound_interface,
     discard_unstamped,
@@ -244,6 +245,7 @@ def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
     """Open a socket that reports ICMP errors and receives nothing."""
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setblocking(False)
+    allow_fragments(opened)
     report_sending_errors(opened)
     refuse_input(opened)
     return opened

@@ -92,11 +92,12 @@ def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
 
 def open_udp(address: Address, purpose: str) -> socket.socket:
     """Open a non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
-    from router.net.kernel import why_not_bound
+    from router.net.kernel import allow_fragments, why_not_bound
 
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         opened.setblocking(False)
+        allow_fragments(opened)
         opened.bind(address)
     except OSError as error:
         opened.close()

@@ -21,7 +21,7 @@ from router.net.sockets import Inherited
 from router.net.udp import Listener, open_sending
 from router.table.addresses import Address
 from router.table.model import Endpoint, EndpointKind
-from tests.namespaces import cable, computers
+from tests.namespaces import cable, computers, narrow_path
 from tests.net.test_udp import endpoint, plan
 
 PATIENCE = 10.0
@@ -128,6 +128,23 @@ def test_losses_are_counted_one_for_one(stack: ExitStack, make: Make) -> None:
 def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, make: Make, board: socket.socket) -> None:
     with pytest.raises(OSError, match="too long"):
         send_to(stack, make, Address(*board.getsockname())).send(bytes(70000))
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_datagram_larger_than_the_paths_mtu_arrives_though_icmp_is_filtered(
+    stack: ExitStack, make: Make, beside: bool
+) -> None:
+    rover, station = stack.enter_context(narrow_path())
+    board = stack.enter_context(station.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)))
+    board.bind(("10.78.2.2", 9000))
+    board.settimeout(PATIENCE)
+    listener = stack.enter_context(closing(rover.inside(lambda: Listener(plan(host="0.0.0.0", port=5000)))))
+    source = (listener, [listener]) if beside else ()
+    to = endpoint("board", Address("10.78.2.2", 9000))
+    sender = stack.enter_context(closing(rover.inside(lambda: make(to, *source))))
+    for size in (100, 1400, 4000):
+        sender.send(bytes(size))
+        assert len(board.recv(65536)) == size
 
 
 def test_it_sends_from_its_listeners_port_and_answers_reach_the_listener(

@@ -20,6 +20,7 @@ from router.gateway.transport.udp import UdpTransport
 from router.table.addresses import Address
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.transport_events import Events, data, opened
+from tests.namespaces import narrow_path
 from tests.ports import free_port
 
 
@@ -204,3 +205,17 @@ async def test_an_address_that_this_machine_does_not_have_yet_is_waited_for(monk
             monkeypatch.setattr(transport, "_local", local())  # the interface comes up
             await until(lambda: len(events.clients) == 1)
     assert [log["log_level"] for log in logs] == ["warning", "info"]
+
+
+def test_a_packet_larger_than_the_paths_mtu_arrives_though_icmp_is_filtered() -> None:
+    async def serve() -> bytes:
+        events = Events()
+        async with opened(UdpTransport(address_of(headset), None, events)):
+            [client] = events.clients
+            client.write([data(bytes(1400))])
+            return (await hear(headset))[0]
+
+    with narrow_path() as (near, far), far.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as headset:
+        headset.bind(("10.78.2.2", 9000))
+        headset.settimeout(10)
+        assert near.inside(lambda: asyncio.run(serve())) == bytes(1400)

@@ -13,7 +13,7 @@ from contextlib import suppress
 
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
 from router.gateway.transport.binding import Binding
-from router.net.kernel import arrivals, ask_for_receive_buffer, drops
+from router.net.kernel import allow_fragments, arrivals, ask_for_receive_buffer, drops
 from router.table.addresses import Address
 from router.table.units import LARGEST_DATAGRAM
 
@@ -73,6 +73,7 @@ class UdpTransport:
         try:
             # Never SO_REUSEADDR: with it, a second router would steal the port unnoticed.
             opened.bind(self._local or ("", 0))
+            allow_fragments(opened)
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
             if self._local is not None:
                 ask_for_receive_buffer(opened, RECEIVE_BUFFER)
