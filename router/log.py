@@ -78,8 +78,13 @@ logger: FilteringBoundLogger = LazyLogger("router")
 
 def _import_structlog() -> ModuleType:
     """Import structlog without rich and asyncio, which serve tracebacks and methods that are not used here."""
+    import logging
+
     from router.lean import left_out, postponed
 
+    # structlog makes a log record. From Python 3.12 on, records look for the current task in sys.modules["asyncio"]; the
+    # stand-in there would import asyncio.
+    logging.logAsyncioTasks = False  # type: ignore[attr-defined]  # of Python 3.12
     with left_out("rich"), postponed("asyncio"):
         import structlog
     return structlog
