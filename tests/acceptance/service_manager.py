@@ -7,13 +7,12 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from pathlib import Path
 from time import monotonic, sleep
 
 from tests.acceptance.ros_peer import PATIENCE
+from tests.routers import start
 
-ROOT = Path(__file__).parent.parent.parent
 SO_TIMESTAMPNS = 35
 SO_RCVBUFFORCE = 33
 ABOVE = 20
@@ -49,21 +48,22 @@ class ServiceManager:
         """Start the router without waiting."""
         descriptors = [fcntl.fcntl(held, fcntl.F_DUPFD, ABOVE) for held in self.sockets]
         environment = {
-            **os.environ,
             **self._environment,
-            "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))),
             "NOTIFY_SOCKET": str(self._folder / "notify"),
             "FDS": " ".join(map(str, descriptors)),
             "LISTEN_FDS": str(len(descriptors)),
             "LISTEN_FDNAMES": ":".join(["rover-router.socket"] * len(descriptors)),
         }
-        router = (sys.executable, "-m", self.module, "run", str(self._table))
         with self._log.open("a") as log:
-            self.process = subprocess.Popen(
-                ["/bin/bash", "-c", LAUNCH, "launch", *router],
+            self.process = start(
+                ("-m", self.module),
+                "run",
+                self._table,
+                within=("/bin/bash", "-c", LAUNCH, "launch"),
+                environment=environment,
                 stdin=subprocess.DEVNULL,
+                stdout=None,
                 stderr=log,
-                env=environment,
                 pass_fds=descriptors,
             )
         for descriptor in descriptors:

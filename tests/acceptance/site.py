@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import socket
 import struct
 import subprocess
-import sys
 import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,6 +20,7 @@ from typing import Any
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS, ROUTER, TOPICS_FROM_ROS
 from tests.ports import free_port
+from tests.routers import start
 from tests.tasks import of_threads
 
 ROOT = Path(__file__).parent.parent.parent
@@ -90,14 +89,18 @@ class RouterProcess:
 
     def __init__(self, folder: Path, *arguments: object, within: Sequence[str] = (), **environment: str) -> None:
         self._log = folder / "router.log"
-        folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
-        environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover has one
+        path = environment.pop("PYTHONPATH", "")
         with self._log.open("w") as log:
-            self.process = subprocess.Popen(
-                [*within, sys.executable, "-m", self.module, "run", *map(str, arguments)],
+            self.process = start(
+                ("-m", self.module),
+                "run",
+                *arguments,
+                within=within,
+                path=path,
+                environment=environment,
                 stdin=subprocess.DEVNULL,
+                stdout=None,
                 stderr=log,
-                env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
             )
 
     def __enter__(self) -> RouterProcess:

@@ -7,13 +7,17 @@ import os
 import pty
 import signal
 import subprocess
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.acceptance.payloads import generated
-from tests.acceptance.site import ROOT, RouterProcess, site, total
+from tests.acceptance.ros_peer import PATIENCE
+from tests.acceptance.site import RouterProcess, site, total
+from tests.routers import MODULE, log_until_started, start
 
 FLOOD = 2_000
 HANDFUL = 10
@@ -35,34 +39,34 @@ def test_a_flood_is_told_in_a_handful_of_lines_that_add_up(tmp_path: Path) -> No
 
 
 def test_a_person_at_a_terminal_reads_lines(tmp_path: Path) -> None:
-    with site(tmp_path) as place:
-        ours, theirs = pty.openpty()
-        command = [sys.executable, "-m", "router", "run", str(place.table())]
-        with subprocess.Popen(command, cwd=ROOT, stderr=theirs) as process:
-            os.close(theirs)
-            shown = b""
-            while b"router started" not in shown:
-                shown += os.read(ours, 4096)
-            process.terminate()
-        os.close(ours)
-    assert process.returncode == 0
-    assert not any(line.startswith("{") for line in shown.decode().splitlines())
+    ours, theirs = pty.openpty()
+    with site(tmp_path) as place, running(place.table(), stderr=theirs) as process, os.fdopen(ours) as log:
+        os.close(theirs)
+        shown = log_until_started(log)
+        process.terminate()
+        assert process.wait(PATIENCE) == 0
+    assert not any(line.startswith("{") for line in shown)
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_log_that_nobody_reads_any_more_does_not_stop_it(
-    tmp_path: Path, unbuffered: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+def test_a_log_that_nobody_reads_any_more_does_not_stop_it(tmp_path: Path, unbuffered: str) -> None:
     good = next(generated("ph_info")).datagram
-    with site(tmp_path) as place:
-        command = [sys.executable, "-m", "router", "run", str(place.table())]
-        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stderr
-            while "router started" not in process.stderr.readline():
-                assert process.poll() is None
-            process.stderr.close()
-            place.send("sensor_board", b"\xff", b"", good)
-            assert place.receive("basestation") == good
-            process.terminate()
-    assert process.returncode == 0
+    environment = {"PYTHONUNBUFFERED": unbuffered}
+    with site(tmp_path) as place, running(place.table(), environment=environment) as process:
+        assert process.stderr
+        log_until_started(process.stderr)
+        process.stderr.close()
+        place.send("sensor_board", b"\xff", b"", good)
+        assert place.receive("basestation") == good
+        process.terminate()
+        assert process.wait(PATIENCE) == 0
+
+
+@contextmanager
+def running(table: Path, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A router whose log the test reads; it is killed if the test has not ended it."""
+    with start(MODULE, "run", table, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()

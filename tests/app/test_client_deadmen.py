@@ -15,9 +15,10 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from tests.acceptance.site import wait_until
 from tests.app.conftest import Site
-from tests.app.test_starting import MODULE, end, start, wait_for_start
+from tests.app.test_starting import end, wait_for_start
 from tests.ports import free_port
 from tests.ros.peers import Subscriber
+from tests.routers import MODULE, start
 
 TYPE = "comms/msg/DrivingBoardMotorMessage"
 COMMAND = b'{"op": "publish", "topic": "/drive", "data": {"turning_radius": 0, "distance_to_go": 50}}\n'

@@ -25,6 +25,7 @@ from router.errors import ConfigurationError, StartError
 from router.ros.environment import SHM, obstacles, unresolved_peers, uses_shared_memory
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
+from tests.routers import MODULE, log_until_started, start
 from tests.tables import PROTOS, ROUTES
 
 ROOT = Path(__file__).parents[2]
@@ -59,7 +60,6 @@ class Halting:
 sys.meta_path.insert(0, Halting())
 """
 
-MODULE = ["-m", "router"]
 SCRIPT = ["-c", "import sys; from router import main; sys.exit(main())"]
 """What the console script does."""
 
@@ -72,21 +72,9 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def start(how: Sequence[str], *arguments: str | Path, path: str = "", **options: object) -> subprocess.Popen[str]:
-    paths = filter(None, (path, str(ROOT), os.environ.get("PYTHONPATH")))
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
-        [sys.executable, *how, *arguments], text=True, env=environment, **pipes, **options
-    )
-
-
 def wait_for_start(process: subprocess.Popen[str]) -> dict[str, object]:
     assert process.stderr
-    for line in process.stderr:
-        if line.startswith("{") and (entry := json.loads(line))["event"] == "router started":
-            return dict(entry)
-    raise AssertionError("it did not start")
+    return dict(json.loads(log_until_started(process.stderr)[-1]))
 
 
 def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> list[str]:
@@ -494,10 +482,10 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
     table.write_text(table.read_text() + TOPIC)
     full = f"mount -t tmpfs -o size=64k tmpfs {SHM} && head -c 64k /dev/zero > {SHM}/full"
     within = ["unshare", "-m", "sh", "-c", f'{full} && exec "$@"', "sh"]
-    command = [*within, sys.executable, "-m", "router", name, "-t", str(table)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert answer.returncode == 1
-    assert f"{SHM} has 0 KiB free, but ROS 2 needs" in answer.stdout + answer.stderr
+    process = start(MODULE, name, "-t", table, within=within)
+    told = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert f"{SHM} has 0 KiB free, but ROS 2 needs" in "".join(told)
 
 
 def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from router.cli import main
 from router.cli.doctor import shown
 from router.tools.doctor_checks import warning
 from tests.ports import free_port
-
-ROOT = Path(__file__).parent.parent.parent
+from tests.tables import ROUTES
 
 
 @pytest.fixture
@@ -21,11 +20,12 @@ def table(tmp_path: Path) -> Path:
     path = tmp_path / "table.yaml"
     metrics, foxglove = free_port(kind=socket.SOCK_STREAM), free_port(kind=socket.SOCK_STREAM)
     path.write_text(
-        f"extends: {ROOT}/tests/acceptance/quiet.yaml\n"
+        f"extends: {ROUTES}/sim.yaml\n"
         f"http: {{address: 127.0.0.1:{metrics}}}\n"
         f"foxglove: {{address: 127.0.0.1:{foxglove}}}\n"
         f"record: {{directory: {tmp_path}, last: 60s}}\n"
         f"listen: {{rover: {{address: 127.0.0.1:{free_port()}}}}}\n"
+        "gateways: {dashboard: {ignore: its port is fixed}}\n"
     )
     return path
 

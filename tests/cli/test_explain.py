@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -19,6 +17,7 @@ from router.compiler import check_table
 from router.kept import store
 from tests.acceptance.site import ROOT, wait_until
 from tests.ports import free_port
+from tests.routers import MODULE, start
 
 BASE = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
 GATEWAYS = """\
@@ -169,15 +168,11 @@ def test_a_file_that_no_start_can_use_is_named(table: Path, told: Told) -> None:
 
 
 def test_of_a_router_that_runs_it_says_what_its_next_start_does(table: Path) -> None:
-    router = [sys.executable, "-m", "router"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-
     def explained() -> list[str]:
         """From another folder, where `python -m` finds modules elsewhere."""
-        command = [*router, "explain", "-t", str(table)]
-        return without_times(subprocess.check_output(command, cwd=ROOT, env=environment, text=True))
+        return without_times(start(MODULE, "explain", "-t", table, cwd=ROOT).communicate()[0])
 
-    with subprocess.Popen([*router, "run", "table.yaml"], env=environment) as running:
+    with start(MODULE, "run", "table.yaml", stdout=None, stderr=None) as running:
         try:
             wait_until(lambda: bool([*table.parent.glob("cache/rover-router/*.program")]), "a kept program")
             assert explained() == [
