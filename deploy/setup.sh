@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds .venv with the router, ROS 2 Jazzy and the interfaces of schemas/comms, and the carrier's library.
+# Builds .venv with the router, ROS 2 Jazzy and the interfaces of schemas/comms, and the carrier's library. As colcon, it
+# leaves schemas/comms out if that contains a file COLCON_IGNORE.
 # `make setup` calls it.
 #
 #   PYTHON=...  the interpreter to use, 3.10 to 3.13; default: the first suitable one
@@ -140,9 +141,12 @@ build_carrier() {
   AMENT_PREFIX_PATH=$ros "$python" router/carrier/build.py --rcl
 }
 
+remove_comms() {
+  if [ -f "$made/comms.files" ]; then xargs -d '\n' rm -f <"$made/comms.files"; fi
+}
+
 build_comms() (
   build=$venv/build/comms
-  installed=$made/comms.files
   rm -rf "$build"  # left by a failed build; reusing it saves no time, because the generators rewrite every file
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
@@ -157,9 +161,9 @@ build_comms() (
     -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF -DCMAKE_PROJECT_comms_INCLUDE="$root/deploy/interfaces.cmake"
   cmake --build "$build" --parallel "$(nproc)"
   # Remove the old files only now, so that a failed build keeps them. This includes files of deleted messages.
-  if [ -f "$installed" ]; then xargs -d '\n' rm -f <"$installed"; fi
+  remove_comms
   cmake --install "$build"
-  mv "$build/install_manifest.txt" "$installed"
+  mv "$build/install_manifest.txt" "$made/comms.files"
   rm -r "$build"
 )
 
@@ -184,7 +188,7 @@ ros=${ROS:-$remembered}
 # AMENT_CURRENT_PREFIX set, and the script of the interfaces would use it as their location.
 to_source=${ros:+. \"$ros/setup.sh\"
 unset AMENT_CURRENT_PREFIX
-. \"$venv/share/comms/local_setup.sh\"}
+if [ -e \"$venv/share/comms/local_setup.sh\" ]; then . \"$venv/share/comms/local_setup.sh\"; fi}
 dev=${DEV:-$(cat "$made/dev" 2>/dev/null || echo yes)}
 [[ $dev =~ ^(yes|no)$ ]] || die "DEV=$dev is neither yes nor no"
 environment=$(printf '%s\n' "$root" "$to_source" "$dev" | checksum)
@@ -208,5 +212,9 @@ if ! is_usable; then
 fi
 step packages "$packages" "packages${ros:+, with ROS from $ros}" install_packages
 step carrier "$carrier" "carrier" build_carrier
-step comms "$comms" "ROS interfaces of schemas/comms" build_comms
+if [ -e schemas/comms/COLCON_IGNORE ]; then
+  step comms "$comms" "no ROS interfaces of schemas/comms" remove_comms
+else
+  step comms "$comms" "ROS interfaces of schemas/comms" build_comms
+fi
 compile_router

@@ -82,8 +82,8 @@ def _import_structlog() -> ModuleType:
 
     from router.lean import left_out, postponed
 
-    # structlog makes a log record. From Python 3.12 on, records look for the current task in sys.modules["asyncio"]; the
-    # stand-in there would import asyncio.
+    # structlog makes a log record. From Python 3.12 on, a record looks for the current task in sys.modules["asyncio"],
+    # and the stand-in there would import asyncio.
     logging.logAsyncioTasks = False  # type: ignore[attr-defined]  # of Python 3.12
     with left_out("rich"), postponed("asyncio"):
         import structlog

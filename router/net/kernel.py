@@ -155,7 +155,7 @@ def report_sending_errors(opened: socket.socket) -> None:
 def allow_fragments(opened: socket.socket) -> None:
     """Clear "don't fragment" in the datagrams that a socket sends.
 
-    By default Linux sets it, and learns a path's MTU from ICMP errors. Where those are filtered, larger datagrams vanish.
+    By default Linux sets it and learns a path's MTU from ICMP errors: where those are filtered, large datagrams vanish.
     """
     opened.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, IP_PMTUDISC_DONT)
 

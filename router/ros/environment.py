@@ -79,10 +79,14 @@ def ros_remedy() -> str:
 
 def ros_package_remedy(package: str) -> str:
     """Return the remedy if a ROS package is missing, cannot be loaded, or differs from that of the compiled table."""
+    from router.types.ros import IGNORED
+
     ours = asset("schemas")
+    source = f"source the workspace that has the ROS package '{package}'"
+    if (ours / package / IGNORED).exists():
+        return source
     if not is_installed(ours):
         return f"run 'make setup' and `. .venv/env.sh`, or install the ROS package '{package}'"
-    source = f"source the workspace that has the ROS package '{package}'"
     if not (ours / package).is_dir():
         return f"{source}, or install it"
     commands = (

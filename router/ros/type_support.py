@@ -7,8 +7,10 @@ A message class imports all classes of its package and of the packages that this
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from router.ros.rcl import RCL
@@ -111,6 +113,27 @@ def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str,
         return None
     metaclass = type(f"Metaclass_{short}", (type,), members)
     return metaclass(short, (), {"__module__": f"{package}.{kind}", "__doc__": f"Stands for {name}."})
+
+
+class _Place(ctypes.Structure):
+    """Dl_info."""
+
+    _fields_ = (
+        ("library", ctypes.c_char_p),
+        ("base", ctypes.c_void_p),
+        ("symbol", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+    )
+
+
+def library_of(message_class: Any) -> Path | None:
+    """Return the C library that describes a loaded type; None if none does."""
+    capsule = message_class.__class__._TYPE_SUPPORT
+    describe = _TypeSupport.from_address(_capsule_pointer(capsule, _capsule_name(capsule))).description
+    place = _Place()
+    if not describe or not ctypes.CDLL(None).dladdr(ctypes.cast(describe, ctypes.c_void_p), ctypes.byref(place)):
+        return None
+    return Path(os.fsdecode(place.library))
 
 
 def _snake_case(name: str) -> str:

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
+from itertools import zip_longest
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -20,12 +22,14 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
     NamespacedType,
 )
 
-from router.errors import ConfigurationError, SourceSpan, StartError
+from router.assets import asset
+from router.errors import ConfigurationError, SourceSpan, StartError, shown_path
 from router.lean import left_out, postponed
 from router.ros.environment import ros_package_remedy
-from router.ros.type_support import Definition, class_for_cdr
+from router.ros.type_support import Definition, class_for_cdr, library_of
 from router.shortage import is_shortage
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from router.types.ros import IGNORED, msg_files
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
 
@@ -62,19 +66,65 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
     Raises StartError unless the type and its nested types are installed as in `definitions`.
     """
     package, kind, short = _parts(name)
+    found = None
     if _has_part(package, kind):
         with lean_interfaces():
             found = class_for_cdr(package, kind, short, definitions)
-        if found is not None:
+        if found is not None and _other_library(package, found) is None:
             return found
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
-            raise ConfigurationError(
-                f"the installed {part} is not the one the table was compiled for; {_remedy(part)}\n"
-                f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
-            )
-    return loaded_class(name)
+            raise _mismatch(part, installed, compiled)
+    if found is not None:
+        return found
+    found = loaded_class(name)
+    if (library := _other_library(package, found)) is not None:
+        is_ignored = (asset("schemas") / package / IGNORED).exists()
+        raise ConfigurationError(
+            f"the package '{package}' is installed twice: {_folder(package)} is used with {library}",
+            "run 'make setup', which removes the ignored one" if is_ignored else "source only one of them",
+        )
+    return found
+
+
+def _other_library(package: str, message_class: Any) -> Path | None:
+    """Return the C library of a type if it is not of the same installation as the Python package.
+
+    Two workspaces, or a workspace and Python's environment, may have a package of that name. The wheels of ROS 2 order
+    LD_LIBRARY_PATH at random.
+    """
+    library = library_of(message_class)
+    prefix = _folder(package).parents[3]  # above lib/python3.12/site-packages/PACKAGE
+    return None if library is None or library.is_relative_to(prefix) else library
+
+
+def _folder(package: str) -> Path:
+    return Path(importlib.import_module(package).__path__[0])
+
+
+def _mismatch(name: str, installed: Definition, compiled: Definition) -> ConfigurationError:
+    """Return an error with the first field that differs, and where both definitions come from."""
+    package = name.partition("/")[0]
+    folder = _folder(package)
+    found = msg_files().find(name)
+    file = found.file if found else "rosbags"
+    pairs = enumerate(zip_longest(installed, compiled), 1)
+    number, (there, here) = next((number, pair) for number, pair in pairs if pair[0] != pair[1])
+    what = (
+        f"the installed {name} is not the one the table was compiled for: "
+        f"field {number} is {_field(there)} in {folder}, {_field(here)} in {file}"
+    )
+    ours = asset("schemas") / package
+    if Path(file).absolute().parent != ours / "msg" or folder.is_relative_to(sys.prefix):
+        return ConfigurationError(what, _remedy(name))
+    ignored = shown_path(ours / IGNORED)
+    remedy = f"to use the package of that workspace, create {ignored} and run 'make setup'; else do not source it"
+    return ConfigurationError(what, remedy)
+
+
+def _field(field: tuple[str, str] | None) -> str:
+    return "missing" if field is None else f"'{field[1]} {field[0]}'"
 
 
 def loaded_class(name: str) -> Any:
@@ -139,10 +189,6 @@ def _member(module: ModuleType, name: str) -> Any:
 
 def _remedy(name: str) -> str:
     return ros_package_remedy(name.partition("/")[0])
-
-
-def _fields(definition: Definition) -> str:
-    return ", ".join(f"{kind} {name}" for name, kind in definition)
 
 
 def installed_type(name: str) -> MessageType:

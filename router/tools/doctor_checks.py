@@ -406,17 +406,16 @@ def ros(program: Program) -> Iterator[CheckResult]:
     except ImportError as error:
         yield problem("ROS", f"the table has topics, but ROS 2 cannot be loaded: {error}", ros_remedy())
         return
-    wrong: dict[str, dict[str, str]] = {}
+    wrong: dict[str, dict[str, StartError]] = {}
     for plan in plans:
         try:
             usable_class(plan.type_name, plan.definitions)
         except StartError as error:
-            wrong.setdefault(plan.type_name.partition("/")[0], {})[plan.type_name] = str(error)
+            wrong.setdefault(plan.type_name.partition("/")[0], {})[plan.type_name] = error
     for package, errors in wrong.items():
-        remedy = ros_package_remedy(package)
-        what = next(iter(errors.values())).removesuffix(f"; {remedy}")
+        first = next(iter(errors.values()))
         more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
-        yield problem("ROS", f"{what}{more}", remedy)
+        yield problem("ROS", f"{first.what}{more}", first.hint or ros_package_remedy(package))
     unresolved = list(unresolved_peers(os.environ))
     yield from (problem("ROS", each.what, each.hint) for each in unresolved)
     if not wrong and not unresolved:

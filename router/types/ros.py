@@ -24,6 +24,9 @@ from router.types.msg import PRIMITIVES, MsgDefinition, MsgError, parse_msg
 _TYPE_NAME = re.compile(r"(?P<package>[a-z]\w*)/msg/(?P<name>[A-Z]\w*)", re.ASCII)
 _PLACEHOLDER = "structure_needs_at_least_one_member"
 
+IGNORED = "COLCON_IGNORE"
+"""A file in the folder of a package that colcon, `make setup` and the router ignore."""
+
 DEFAULTS_MISSING_IN_ROSBAGS: dict[tuple[str, str], object] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
@@ -51,14 +54,16 @@ class MsgFiles:
         if parts is None:
             return None
         for folder in self._folders:
-            path = folder / parts["package"] / "msg" / f"{parts['name']}.msg"
-            if inputs.is_file(path):
+            package = folder / parts["package"]
+            path = package / "msg" / f"{parts['name']}.msg"
+            if inputs.is_file(path) and not inputs.exists(package / IGNORED):
                 return _read(path, parts["package"])
         return None
 
     def names(self) -> Iterator[str]:
         for folder in self._folders:
-            for package in inputs.listing(folder)[0]:
+            packages = inputs.listing(folder)[0]
+            for package in (each for each in packages if not inputs.exists(folder / each / IGNORED)):
                 for file in inputs.listing(folder / package / "msg")[1]:
                     name, _, ending = file.rpartition(".")
                     if ending == "msg":

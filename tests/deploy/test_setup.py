@@ -216,6 +216,20 @@ def test_interfaces_that_are_no_more_go_when_the_new_ones_are_built(checkout: Ch
     assert built.with_name("local_setup.sh").exists()
 
 
+def test_interfaces_that_colcon_ignores_are_neither_built_nor_kept(checkout: Checkout) -> None:
+    ignored, built = checkout.root / "schemas/comms/COLCON_IGNORE", checkout.root / ".venv/share/comms/local_setup.sh"
+    checkout.set_up(ROS=str(checkout.ros))
+    assert built.exists()
+    ignored.touch()
+    assert checkout.set_up()[1:] == []
+    assert not built.exists()
+    assert "/.venv" not in checkout.sourced("AMENT_PREFIX_PATH")
+    assert checkout.set_up() == ["setup: .venv is up to date"]
+    ignored.unlink()
+    checkout.set_up()
+    assert built.exists()
+
+
 @pytest.mark.parametrize(("apt", "with_tools", "without"), [(False, "[ros,dev]", "[ros]"), (True, "[dev]", "")])
 def test_tools_for_developers_can_be_left_out(checkout: Checkout, apt: bool, with_tools: str, without: str) -> None:
     assert checkout.installed(checkout.set_up(DEV="no", ROS=str(checkout.ros) if apt else "")) == without

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -32,6 +33,7 @@ from router.ros import types as ros_types
 from router.ros.types import installed_class, installed_type, loaded_class, usable_class
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
+from tests.compiler.interface_package import built, environment, is_buildable
 
 ACTION = """\
 class Wait_Feedback:
@@ -206,6 +208,43 @@ def test_a_type_for_cdr_imports_no_class() -> None:
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert child.stdout == "set()\n"
+
+
+USE = """\
+import sys
+from router.errors import StartError
+from router.ros.types import usable_class
+
+try:
+    print(usable_class("nasty/msg/Inner", {"nasty/msg/Inner": (("name", "string"), ("value", sys.argv[1]))}).__name__)
+except StartError as error:
+    print(error.what)
+"""
+
+
+@pytest.mark.skipif(not is_buildable(), reason="needs the generators of rosidl")
+@pytest.mark.parametrize(
+    ("python", "table", "told"),
+    [
+        ("double", "double", "Inner"),
+        ("float", "double", "field 2 is 'float value' in {package}, 'double value' in"),
+        ("float", "float", "the package 'nasty' is installed twice: {package} is used with {library}"),
+    ],
+)
+def test_a_package_that_two_workspaces_have_is_used_only_if_both_are_like_the_table(
+    tmp_path: Path, python: str, table: str, told: str
+) -> None:
+    """The Python package comes from one of them, the C library from the other."""
+    install = built()
+    [original] = install.glob("lib/python3.*/site-packages/nasty")
+    package = tmp_path / original.relative_to(install)
+    shutil.copytree(original, package)
+    inner = package / "msg" / "_inner.py"
+    inner.write_text(inner.read_text().replace("'value': 'double'", f"'value': '{python}'"))
+    variables = environment(install)
+    variables["PYTHONPATH"] = f"{package.parent}:{variables['PYTHONPATH']}"
+    said = subprocess.check_output([sys.executable, "-c", USE, table], env=variables, text=True)
+    assert told.format(package=package, library=install / "lib/libnasty__rosidl_generator_c.so") in said
 
 
 def test_a_request_without_fields_has_none() -> None:

@@ -100,6 +100,14 @@ def test_type_that_is_not_installed_comes_out_of_rosbags(interfaces: Interfaces)
     assert [(field.name, field.default) for field in orientation.fields][-1] == ("w", 1.0)  # type: ignore[union-attr]
 
 
+def test_a_package_that_colcon_ignores_is_ignored(interfaces: Interfaces) -> None:
+    ours = {"ours_msgs/msg/A.msg": "bool a\n", "theirs_msgs/msg/A.msg": "bool a\n", "theirs_msgs/COLCON_IGNORE": ""}
+    found = interfaces(ours)
+    assert found.get("ours_msgs/msg/A") is not None
+    assert found.get("theirs_msgs/msg/A") is None
+    assert {name for name in found.names() if name.endswith("_msgs/msg/A")} == {"ours_msgs/msg/A"}
+
+
 def test_rosbags_is_not_imported_for_what_is_installed() -> None:
     script = (
         "import sys\n"
