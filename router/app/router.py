@@ -30,6 +30,7 @@ from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
+from router.table.model import HOW_TO_KEEP
 from router.threads import DaemonThread, StopStack, background_threads
 
 if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time until the ports are bound
@@ -349,7 +350,7 @@ class Services:
         A request is ignored while an earlier one has not begun.
         """
         if self._recorder is None:
-            logger.warning("nothing to save: the table has no 'record: {last: ...}'")
+            logger.warning("nothing to save: the table keeps no datagrams", remedy=HOW_TO_KEEP)
             return
         if not self._saving.has_waiting():
             try:

@@ -36,7 +36,7 @@ from router.compiler.expressions.kinds import (
 from router.compiler.expressions.lists import fitted, limited
 from router.compiler.expressions.scope import field_of, require_readable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.errors import Code, SourceSpan, did_you_mean
+from router.errors import Code, SourceSpan, did_you_mean, plural
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 _SECONDS = IntKind(INT64.low // NS_PER_SECOND, INT64.high // NS_PER_SECOND)
@@ -160,13 +160,23 @@ def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = element_of(value.kind), length_of(value.kind)
     if element_kind is None:
-        raise mismatch(value, target, "write a list, [a, b]")
+        raise mismatch(value, target, how_to_fill(target, scope))
     if length is not None:
         _require_length(value, target, length)
     if isinstance(value, tree.Each):
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
     element = tree.Variable(element_kind, value.span, scope.element_variable())
     return Each(target, ((element.name, value),), _to_element(element, target.element, scope), value.span)
+
+
+_LIKE_MESSAGES = "fill it from a list of messages, or from messages, [a, b]; fields of the same name are copied"
+
+
+def how_to_fill(target: List, scope: Scope) -> str:
+    """Return the hint for a list that something else than a list would fill."""
+    if not isinstance(target.element, MessageType):
+        return "write a list, [a, b]"
+    return _LIKE_MESSAGES if tree.MESSAGE in scope.given else "leave it out: only a list of messages can fill it"
 
 
 def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
@@ -176,8 +186,8 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
     except ExpressionError as error:
         found = error.diagnostic
         if not isinstance(element.kind, MessageKind):
-            raise
-        if isinstance(target, MessageType):
+            hint = _LIKE_MESSAGES if isinstance(target, MessageType) else found.hint
+        elif isinstance(target, MessageType):
             both = f"{element.kind} and {target}"
             hint = f"give {both} fields of the same name and type: elements are filled by name"
         else:
@@ -187,11 +197,14 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
 
 def _require_length(value: tree.Node, target: List, length: int) -> None:
     if target.length is not None and length != target.length:
-        raise ExpressionError(value.span, Code.TYPE_MISMATCH, f"{target} takes {target.length} elements, not {length}")
+        message = f"{target} takes {target.length} elements, not {length}"
+        change = "add" if length < target.length else "remove"
+        hint = f"{change} {plural(abs(target.length - length), 'element')}"
+        raise ExpressionError(value.span, Code.TYPE_MISMATCH, message, hint)
     if target.bound is not None and length > target.bound:
-        raise ExpressionError(
-            value.span, Code.OUT_OF_RANGE, f"{target} takes at most {target.bound} elements, not {length}"
-        )
+        message = f"{target} takes at most {target.bound} elements, not {length}"
+        hint = f"remove {plural(length - target.bound, 'element')}"
+        raise ExpressionError(value.span, Code.OUT_OF_RANGE, message, hint)
 
 
 # scalars
@@ -234,6 +247,9 @@ _OF_LIST = ", or min(x), max(x), sum(x) or len(x)"
 def mismatch(value: tree.Node, target: Type, hint: str = "") -> ExpressionError:
     """Return the error for a value whose kind cannot fill the type."""
     if isinstance(value.kind, ListKind) and not isinstance(target, (List, MessageType)):
+        element = value.kind.element
+        if isinstance(element, MessageKind) and (field := next(iter(element.type.fields), None)):
+            hint = hint or f"write a field of one element, such as x[0].{field.name}"
         hint = hint or "write x[0] for one element" + _OF_LIST * isinstance(target, (Int, Float))
     if not isinstance(target, (List, MessageType)):
         hint = hint or fields_hint(value.kind)

@@ -151,6 +151,11 @@ class Lookup:
             message = f"there is no package '{package.value}' with ROS messages"
             self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
             return
+        if other := _OTHER_INTERFACES.fullmatch(name.value):
+            what = f"'{name.value}' is {'a service' if other['kind'] == 'srv' else 'an action'}, not a message"
+            hint = "topics have message types, such as std_msgs/msg/Bool; services and actions are not routed"
+            self.report(name.span, Code.UNKNOWN_ROS_TYPE, what, hint)
+            return
         hint = _ros_type_hint(name.value, known)
         if package is not None:
             hint = f"the type is made from `defaults.package`; set the topic's 'type' ({hint})"
@@ -249,6 +254,8 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     return f"{_SOURCE.format(package)}{'; or ' * bool(other)}{other}"
 
 
+_OTHER_INTERFACES = re.compile(r"\w+/(?P<kind>srv|action)/\w+")
+"""Types of services and actions."""
 _SAME_PACKAGE = 0.85
 """Similarity required of a misspelt package name: `my_interfaces` is not `rcl_interfaces`."""
 _SOURCE = "build '{}' and source its workspace (`source install/setup.bash`)"

@@ -11,14 +11,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Union
 
-from router.compiler.conversion import convert, same_named, unset
+from router.compiler.conversion import convert, how_to_fill, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.tree import Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest, one_of
 from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TEXT
-from router.types.model import Field, MessageType, String, Type
+from router.types.model import Field, List, MessageType, String, Type
 from router.types.paths import ways
 
 _FRAME = re.compile(r"/?\w+(?:[/-]\w+)+|/\w+")
@@ -45,6 +45,7 @@ class FieldMapping:
     findings: list[Diagnostic] = field(default_factory=list)
 
 
+_ONE_VALUE = "assign one value to it, or choose one: {map: FIELD, VALUE: ..., else: ...}"
 _MISSPELT = 0.9
 """Minimum similarity of a name that can only be a misspelt field of the target."""
 
@@ -107,11 +108,18 @@ def build(
     plan = builder.record(given, automatic, "")
     outcome = FieldMapping(plan, builder.rows, builder.findings or list(presence_findings(plan)))
     if target.fields and not builder.rows and not outcome.findings:
-        hint = "map its fields, or write `fields: auto`"
+        hint = "map its fields"
+        if _may_be_automatic(scope, target):
+            hint += ", or write `fields: auto`"
         if automatic is not None:
             hint = f"map the fields by hand: {automatic.kind} and {target} have no field name in common"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
     return outcome
+
+
+def _may_be_automatic(scope: Scope, target: MessageType) -> bool:
+    """Return whether `auto` would fill a field of the target."""
+    return any(scope.message.field(member.name) for member in target.fields)
 
 
 _MOST_NAMES = 4
@@ -171,9 +179,12 @@ class _Builder:
                 path = entry.path[:depth]
                 if path not in self._whole:
                     self._whole.add(path)
-                    message = f"{holder} has no fields"
-                    hint = "assign one value to it, or choose one: {map: FIELD, VALUE: ..., else: ...}"
-                    hint = "write text as {text: WORD}" if isinstance(holder, String) else hint
+                    message, hint = f"{holder} has no fields", _ONE_VALUE
+                    if isinstance(holder, String):
+                        hint = "write text as {text: WORD}"
+                    elif isinstance(holder, List):
+                        message = f"'{entry.path[depth - 1]}' is a list of {holder.element}, and a list has no fields"
+                        hint = how_to_fill(holder, self.scope)
                     self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))
                 return []
             member = holder.field(name)

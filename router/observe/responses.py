@@ -25,6 +25,7 @@ from router.observe.running import Running
 from router.observe.snapshot import COLLECTED_AT
 from router.observe.status import Status
 from router.observe.watch import Health
+from router.table.model import HOW_TO_KEEP
 
 PAGE = Path(__file__).with_name("status_page.html")
 
@@ -42,7 +43,7 @@ GZIP_FROM = 1000
 OPEN_METRICS = "application/openmetrics-text"
 
 TEXT, JSON, HTML = "text/plain; charset=utf-8", "application/json", "text/html; charset=utf-8"
-_NO_RECORDING = "the table keeps no datagrams to save: add 'record: {last: 60s}'"
+_NO_RECORDING = f"the table keeps no datagrams to save: {HOW_TO_KEEP}"
 
 Query = Mapping[str, Sequence[str]]
 

@@ -14,8 +14,20 @@ from typing import NamedTuple
 
 import yaml
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
+from router.errors import Code, Diagnostic, SourceSpan, TableError, nearest
+from router.table.nodes import (
+    REASONS,
+    SAY_WHY,
+    Entry,
+    MappingNode,
+    Node,
+    Plain,
+    ScalarNode,
+    SequenceNode,
+    TextPlace,
+    cut_off,
+    locate,
+)
 from router.table.source import Source, fill, foreign_blank, has_variables, unusable_character
 
 MAX_DEPTH = 32
@@ -103,13 +115,20 @@ class _Composer:
     def _alias(self, event: yaml.AliasEvent) -> None:
         if event.anchor not in self._anchors:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
-            problem = "is inside the value that it repeats" if recursive else "has no anchor"
+            problem = "is inside the value that it repeats" if recursive else "has no anchor above it"
             what = f"the alias '*{event.anchor}' {problem}"
             raise self._fatal(
-                self._span(event), what, "write out the value" if recursive else "quote text that begins with '*'"
+                self._span(event), what, "write out the value" if recursive else self._anchor_hint(event.anchor or "")
             )
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
+
+    def _anchor_hint(self, name: str) -> str:
+        if near := nearest(name, self._anchors):
+            return f"did you mean '*{near}'?"
+        if re.search(rf"&{re.escape(name)}(?!\S)", self._source.text):
+            return f"move the value with '&{name}' above the first '*{name}'"
+        return f"write '&{name}' before the value that it repeats, in this file; quote text that begins with '*'"
 
     def _add(self, node: Node, size: int, anchor: str | None) -> None:
         if anchor is not None:
@@ -128,7 +147,7 @@ class _Composer:
         place = self._place(event, span)
         broken = self._has_tag(event, span)
         text = event.value
-        if has_variables(text):
+        if is_filled := has_variables(text):
             text, problems = fill(text, self._environ)
             for problem in problems:
                 part = place.part(problem.start, problem.end)
@@ -142,20 +161,28 @@ class _Composer:
                 span, f"'{text}' ends with a ','", "remove it: ',' separates values only inside brackets"
             )
         if event.style or broken:
-            return ScalarNode(span, text, text, place, broken)
+            return ScalarNode(span, text, text, place, broken, is_filled)
         if found := surprise(text):
             # Shows a variable by name, since its value may be secret.
             what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
             remedy = f"{found.remedy}; for text, " if found.remedy and not self._is_key() else ""
             hint = f'{remedy}quote it: "{event.value}"'
+            if (key := self._key()) in REASONS and truth_of(text) is not None:
+                hint = SAY_WHY.format(key)
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
-        return ScalarNode(span, text, resolve(text), place, broken)
+        return ScalarNode(span, text, resolve(text), place, broken, is_filled)
 
     def _is_key(self) -> bool:
         """Return whether the next node is a key of a mapping."""
         parent = self._open[-1] if self._open else None
         return parent is not None and isinstance(parent.event, yaml.MappingStartEvent) and not len(parent.children) % 2
+
+    def _key(self) -> str:
+        """Return the key whose value the next node is; empty if there is none."""
+        parent = self._open[-1] if self._open and not self._is_key() else None
+        key = parent.children[-1] if parent and isinstance(parent.event, yaml.MappingStartEvent) else None
+        return key.text if isinstance(key, ScalarNode) else ""
 
     def _place(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextPlace:
         line, first, end_line, last = _marks(event)
@@ -278,11 +305,12 @@ _NUMBERS = frozenset("0123456789+-.")
 _OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
 _BINARY = Surprise("a binary number", "write a decimal number")
 _HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
+_TRUTHS = {"yes": True, "on": True, "no": False, "off": False}
 _GROUPED = Surprise("a number", "leave out the '_'")
 _WORD_SURPRISES: dict[str, Surprise] = {
     **{
-        spelling: Surprise("a truth value", f"write {meaning}")
-        for word, meaning in (("yes", "true"), ("on", "true"), ("no", "false"), ("off", "false"))
+        spelling: Surprise("a truth value", f"write {'true' if truth else 'false'}")
+        for word, truth in _TRUTHS.items()
         for spelling in (word, word.title(), word.upper())
     },
     "~": Surprise("an empty value", "leave the key out, or in a route write {ignore: why}"),
@@ -298,6 +326,11 @@ _NUMBER_SURPRISES = (
     ),
     (re.compile(r"(?=.*_)[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?"), _GROUPED),
 )
+
+
+def truth_of(text: str) -> bool | None:
+    """Return what YAML 1.1 reads a word as, such as `yes`; None for anything that is not a truth value."""
+    return _TRUTHS.get(text.lower())
 
 
 def resolve(text: str) -> Plain:

@@ -8,7 +8,18 @@ from collections.abc import Iterable, Mapping
 
 from router.errors import did_you_mean, nearest
 from router.table.compose import resolve
-from router.table.nodes import MAP, Entry, MappingNode, Node, Path, ScalarNode, node_at, to_data
+from router.table.nodes import (
+    MAP,
+    REASONS,
+    SAY_WHY,
+    Entry,
+    MappingNode,
+    Node,
+    Path,
+    ScalarNode,
+    node_at,
+    to_data,
+)
 from router.table.schema import SchemaError, keys_of, matches, table_schema
 from router.table.source import in_braces
 from router.table.units import EACH, PERIOD, TOPIC_RATE, meant_quantity
@@ -63,6 +74,10 @@ _COMMON_MISTAKES = (
     ("websocket", ("type", "kind", "address", "port"), "write its kind and address, such as {websocket: 0.0.0.0:8765}"),
     ("package", ("timeout", "repeat"), "write `deadman: {timeout: 500ms, repeat: 100ms}`"),
     ("repeat", ("send", "at_start"), "set it in each deadman"),
+    ("obeyed", ("within",), "move it into 'obeyed': `obeyed: {CASE: CONDITION, within: 2s}`"),
+    ("record", ("directory", "continuous", "last", "rotate_after", "retention"), "move it into 'record'"),
+    ("rotate_after", ("size", "age"), "move it into 'rotate_after'"),
+    ("http", ("address",), "move it into the part that it is the address of: 'http', 'foxglove' or a listener"),
     ("at", ("wait", "sleep", "delay", "after"), "write the time since the start of the test: `at: 500ms`"),
     ("extends", ("description", "name", "title"), "write descriptions as comments: `# ...`"),
     ("source", ("description", "comment", "note"), "write descriptions as comments: `# ...`"),
@@ -70,6 +85,8 @@ _COMMON_MISTAKES = (
 """A known key, keys that people write beside it by mistake, and the hint for them."""
 CLOSE = 0.7
 """Similarity required of a suggested key: `schema_period` is not suggested for `period`."""
+_SAME = 0.85
+"""Similarity required if the misspelt key is a key elsewhere: `max_rate` may be misplaced, not `max_datagram`."""
 
 
 def meant(name: str, known: Iterable[str]) -> str | None:
@@ -77,15 +94,19 @@ def meant(name: str, known: Iterable[str]) -> str | None:
     known = list(known)
     if ":" in name or for_common_mistake(name, known):
         return None
-    return next((key for key in known if name in _ELSEWHERE.get(key, ())), None) or nearest(name, known, CLOSE)
+    elsewhere = next((key for key in known if name in _ELSEWHERE.get(key, ())), None)
+    return elsewhere or nearest(name, known, _SAME if _is_key(name) else CLOSE)
+
+
+def _is_key(name: str) -> bool:
+    """Return whether a table has such a key anywhere."""
+    return any(name in keys_of(schema) for schema in (table_schema(), *table_schema()["definitions"].values()))
 
 
 def for_common_mistake(name: str, known: Iterable[str]) -> str:
     return next((hint for key, names, hint in _COMMON_MISTAKES if key in known and name in names), "")
 
 
-_IN_WORDS = ("none", "ignore", "because")
-"""Keys whose value is a reason in prose."""
 
 
 def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
@@ -94,7 +115,7 @@ def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
         return ""
     key, written = before[0], before[1].value
     is_nothing = isinstance(entry.value, ScalarNode) and entry.value.value is None
-    if is_nothing and isinstance(written, ScalarNode) and key in _IN_WORDS:
+    if is_nothing and isinstance(written, ScalarNode) and key in REASONS:
         return f"quote text that contains ',': `{key}: \"{written.text}, {name}\"`"
     is_below = entry.key.span.line > before[1].key.span.line and not is_nothing
     if key in NAME_FIELDS and isinstance(written, MappingNode) and is_below:
@@ -160,18 +181,39 @@ def _owners(name: str, path: Path) -> str:
         for owner, schema in definitions.items()
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
-    near = [owner for owner in owners if path[:1] == ("routes",) and owner in _OF_ROUTES] or owners
-    places = [_OF_ROUTES.get(owner, f"a '{owner}'") for owner in near]
+    near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
+    places = [_PLACES[owner] for owner in near]
     places += ["the top level"] if name in keys_of(table_schema()) else []
     return f"move it to {', or to '.join(places)}" if places else ""
 
 
-_OF_ROUTES = {
+_OF_PART = {
+    "routes": ("route", "destination", "topic"),
+    "gateways": ("gateway", "inbound", "transport", "zenoh", "topic_pattern", "inbound_deadman"),
+}
+"""Definitions where a key belongs that is misplaced in this part of a table."""
+_PLACES = {
     "route": "the route",
     "destination": "an item of 'destinations'",
     "topic": "an item of 'topics'",
+    "source_topic": "a topic in 'source'",
+    "collect": "'collect'",
+    "deadman": "'deadman'",
+    "age_limit": "'ttl'",
+    "fields": "'fields'",
+    "choice": "a map of values",
+    "literal_text": "the value of a field",
+    "qos": "'qos'",
+    "listener": "a listener",
+    "endpoint": "an endpoint",
+    "gateway": "a gateway",
+    "transport": "'transport'",
+    "zenoh": "'zenoh'",
+    "topic_pattern": "an item of 'include' or 'exclude'",
+    "inbound": "an item of 'inbound'",
+    "inbound_deadman": "the 'deadman' of an item of 'inbound'",
 }
-"""The definitions of parts of a route, and how a hint names them."""
+"""Definitions with keys, and how a hint names them."""
 
 
 def for_value(error: SchemaError) -> str:
@@ -179,7 +221,7 @@ def for_value(error: SchemaError) -> str:
     value = str(error.value)
     if error.keyword == "pattern":
         pattern = error.limit
-        is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited")
+        is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited", "no", "off")
         if is_unset:
             takes_reason = error.path[-1] == "ttl" and error.path[0] != "defaults"
             return "write `ttl: {none: why}`" if takes_reason else f"leave '{error.path[-1]}' out"
@@ -188,15 +230,22 @@ def for_value(error: SchemaError) -> str:
         return _MOST_OFTEN[1]
     if error.keyword == "const" and value == str(error.limit):
         return f"write it without quotes: {value}"
+    if error.path == ("version",):
+        return f"write `version: {error.limit}`: this router knows no other"
     if error.keyword != "enum":
         return ""
     if error.path[-1] in ("qos", "profile") and (key := _QOS_WORDS.get(value)):
         return f"write `qos: {{{key}}}`"
     if near := nearest(value, error.limit):
         return f"did you mean '{near}'?"
+    if error.path[-1] == "kind":
+        return KINDS
     if error.path[-1] == "fields":
         return _AUTO if value in ("*", "all") else _for_fields([value])
     return ""
+
+
+KINDS = "a `board` is a microcontroller, a `basestation` or a `tool` an ordinary computer"
 
 
 def _locator(value: str, error: SchemaError) -> str:
@@ -247,12 +296,14 @@ _INSTEAD: Mapping[Path, str] = {
     ("node",): "{{name: {0}}}",
     ("record",): "{{directory: {0}}}",
     ("defaults", "deadman"): "{{timeout: {0}}}",
+    ("routes", "*", "deadman"): "{{timeout: {0}, send: {{CASE: {{FIELD: VALUE}}}}}}",
     ("gateways", "*", "topics"): "{{include: [{0}]}}",
     ("gateways", "*", "inbound", "*"): "{{topic: {0}, type: TYPE}}",
 }
 """Mappings that people write as a single value, and what to write instead."""
 
 _WORDS: Mapping[tuple[Path, str], str] = {
+    (("routes", "*", "deadman"), "none"): "write `deadman: {none: why}`",
     (("gateways", "*", "topics"), "*"): "leave 'topics' out to send every topic",
     (("gateways", "*", "topics"), "all"): "leave 'topics' out to send every topic",
     (("gateways", "*", "transport"), "udp"): "write `transport: {udp: IP:PORT}`",
@@ -283,6 +334,8 @@ def for_type(error: SchemaError, tree: Node) -> str:
         return _ADD_SPACE
     if error.path[:-1] == ("routes",):
         return f"write `{name}: {{ignore: why}}`" if value in (False, "ignore", "none") else ""
+    if name in REASONS:
+        return SAY_WHY.format(name)
     if said := next(
         (hint for (place, word), hint in _WORDS.items() if word == value and _is_at(error.path, place)), ""
     ):
@@ -324,8 +377,15 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     """Return a hint with the value in the form that its key takes."""
     if isinstance(value, str) and _is_of(error.limit, resolve(value)):
         return f"write it without quotes: {value}"
+    if isinstance(value, str) and (written := as_variable(value)):
+        return written
     if isinstance(value, bool):
         return _for_truth(error.path, value)
+    if name == "send" and isinstance(value, str):
+        case = _in_flow(value)
+        return f"write `send: {{{case}: {{FIELD: VALUE}}}}`, or `send: {{{case}: {{}}}}` for defaults"
+    if isinstance(value, dict) and isinstance(error.path[-1], int) and any(key in error.path for key in NAME_FIELDS):
+        return "write each element as one expression, for a value or a whole message: [a, b]"
     if hint := _for_collection(error, value) or _with_unit(error, value):
         return hint
     if _is_at(error.path[-3:], ("deadman", "send", "*")):
@@ -351,6 +411,8 @@ def _for_truth(path: Path, value: bool) -> str:
         return without_case({str(path[-1]): value})
     if path in _ON:
         return f"write `{path[0]}: {_ON[path]}`" if value else f"leave '{path[0]}' out"
+    if path[-1:] == ("deadman",) and path[:1] == ("routes",) and not value:
+        return "write `deadman: {none: why}`"
     return _AUTO if value and path[-1:] == ("fields",) else ""
 
 
@@ -392,7 +454,7 @@ def _is_named(item: object) -> bool:
 def _with_unit(error: SchemaError, value: object) -> str:
     """Return a hint for a number without its unit."""
     pattern = str(error.schema.get("pattern", ""))
-    if not pattern or not isinstance(value, (int, float)):
+    if not pattern or not isinstance(value, (int, float)) or matches(str(value), pattern):
         return ""
     written = [each for unit in ("ms", "s", "B", "B/s") if matches(each := f"{value}{unit}", pattern)]
     return " or ".join((f"write `{written[0]}`", *(f"`{each}`" for each in written[1:]))) if written else ""

@@ -102,6 +102,8 @@ _AFTER_VALUE = (
     ),
 )
 """Text after a quoted or bracketed value that looks like a continuation of it."""
+_CUT_CALL = re.compile(r"\w\([^()]*,[^()]*$")
+"""The beginning of a call whose arguments a ',' separates."""
 _FOREIGN = re.compile(
     r"(?:^|[-:,?{}\[\]])\s*?(?P<at_start>[^\S \t]|[\u200b-\u200d\u2060\u2013\u2014\u2018-\u201f])"
     r"|(?<=[!-~])(?P<inside>[\uff0c\uff1a\uff1b\uff3b\uff3d\uff5b\uff5d])"
@@ -203,6 +205,8 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
     problem, start = error.problem or str(error), error.context_mark
     if character == "\t":
         return _TAB
+    if problem in _NOT_CLOSED and character == "{" and before.endswith("$"):
+        return _Advice("a '${' is not allowed inside brackets", f"quote it: {_quoted_around(written, column)}")
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
         return _Advice(f"a '{character}' is not allowed inside a word here", "quote text that contains brackets")
     if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
@@ -222,6 +226,15 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
         return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])
     passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
     return _ADVICE.get(problem, passed_on)
+
+
+_WORD_WITH_VARIABLES = re.compile(r"(?:\$\{[^}]*\}|[^\s,{}\[\]])+")
+
+
+def _quoted_around(written: str, column: int) -> str:
+    """Return the word around a column, with variables, in quotes."""
+    words = (match for match in _WORD_WITH_VARIABLES.finditer(written) if match.end() > column)
+    return f'"{next(words, ("NAME",))[0]}"'
 
 
 def _colon(problem: str, before: str, after: str) -> _Advice | None:
@@ -258,6 +271,8 @@ def _behind_value(written: str, column: int, closing: str) -> _Advice:
     for pattern, advice in _AFTER_VALUE:
         if pattern.match(written, column):
             return advice
+    if closing and _CUT_CALL.search(_HIDDEN.sub(lambda match: "_" * len(match[0]), written)[:column]):
+        return _Advice("a ',' inside brackets ended the value before this", "quote the whole expression")
     if closing:
         hint = f"replace it with '{closing}', or remove it" if character in ("]", "}") else ""
         return _Advice(f"a ',' or '{closing}' is missing before this", hint)

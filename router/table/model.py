@@ -163,6 +163,13 @@ class RecordSettings:
     retention: Annotated[int, DISK_SIZE] = 4 << 30
 
 
+HOW_TO_KEEP = (
+    "add `last: 60s` to the table's 'record', or `record: {directory: ../recordings, last: 60s, continuous: false}`, "
+    "and restart the router"
+)
+"""What to do if a router keeps no datagrams to save."""
+
+
 @dataclass(frozen=True, slots=True)
 class Expression:
     """The text of an expression, not yet parsed.

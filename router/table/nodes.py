@@ -68,13 +68,17 @@ Plain = Union[None, bool, int, float, str]
 
 @dataclass(frozen=True, slots=True)
 class ScalarNode:
-    """A scalar: `text` as written, with variables replaced, `value` in YAML, and the `place` of the text."""
+    """A scalar: `text` as written, with variables replaced, `value` in YAML, and the `place` of the text.
+
+    If the text `is_filled`, at least one variable was replaced.
+    """
 
     span: SourceSpan
     text: str
     value: Plain
     place: TextPlace
     broken: bool = False
+    is_filled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +193,12 @@ def _child(node: Node, step: str | int) -> Node:
 
 MAP, ELSE, TEXT = "map", "else", "text"
 """Keys of values that are written as mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
+
+REASONS = ("ignore", "none", "because")
+"""Keys whose value is a reason in words."""
+
+SAY_WHY = "say why in words: `{}: TEXT`"
+"""The hint for a value of such a key that is no reason."""
 
 _INDISPENSABLE = frozenset({
     "source", "ignore", "none", "for_each", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count",

@@ -13,8 +13,9 @@ from dataclasses import replace
 from router.errors import Code, Diagnostic, SourceSpan, nearest
 from router.table import hints
 from router.table.addresses import BadAddressError, parse_address
+from router.table.compose import resolve, truth_of
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten
-from router.table.reading import mapping
+from router.table.reading import mapping, scalar
 from router.table.schema import SCHEMA, SchemaError, keys_of, schema_errors, table_schema
 
 _TYPES = {
@@ -42,6 +43,7 @@ _HINTS_FOR_MISSING = {
     "transport": "add it, or write 'ignore: why'",
     "version": "start with 'version: 1'",
     "receive": "add the local address that receives what its client publishes",
+    "directory": "add the folder for recordings, as in `directory: ../recordings`",
 }
 _BELONG_TOGETHER = ("envelope", "listen", "routes")
 _HINT_FOR_WHOLE = "write 'envelope', 'listen' and 'routes'; or, for a table without datagrams, only 'gateways'"
@@ -50,6 +52,9 @@ _HINT_FOR_WHOLE = "write 'envelope', 'listen' and 'routes'; or, for a table with
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """Return the tree with misspelt keys corrected and everything that has a finding marked broken."""
     found = schema_errors(root, SCHEMA)
+    if filled := {error.path: functools.partial(_as_taken, kinds=error.limit) for error in found if _is_filled(error, root)}:
+        root = mapping(rewritten(root, filled))
+        found = schema_errors(root, SCHEMA)
     if not found:
         return root
     tree = _with_deep_keys(root, {error.path[:2] for error in found}, findings)
@@ -66,12 +71,37 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
         found = schema_errors(tree, SCHEMA)
     rests = {error.path for error in found if _is_rest(tree, error.path)}
     found = [error for error in found if error.path not in rests]
+    _explain_words(found, tree, findings)
     implied = _consequences(found)
     findings.extend(
         finding(error, tree) for error in found if error not in implied and not _is_broken(tree, error.path)
     )
     tree = rewritten(tree, {error.path: _as_broken for error in found})
     return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
+
+
+def _is_filled(error: SchemaError, tree: Node) -> bool:
+    """Return whether the value of the wrong type comes from a variable, which has no type."""
+    node = node_at(tree, error.path) if error.keyword == "type" and not error.about_name else None
+    return isinstance(node, ScalarNode) and node.is_filled
+
+
+def _as_taken(node: Node, kinds: str | list[str]) -> Node:
+    """Return a scalar from a variable with the value that a key for `kinds` of values takes, quoted or not."""
+    found = scalar(node)
+    return replace(found, value=found.text if "string" in kinds else resolve(found.text))
+
+
+def _explain_words(found: list[SchemaError], tree: Node, findings: list[Diagnostic]) -> None:
+    """Replace the finding for an ambiguous word, such as `yes`, that is wrong as a truth value and as text."""
+    ambiguous = {each.span: index for index, each in enumerate(findings) if each.code is Code.AMBIGUOUS_SCALAR}
+    for error in found:
+        node = None if error.about_name or error.is_about_keys else node_at(tree, error.path)
+        if not isinstance(node, ScalarNode) or node.span not in ambiguous or "boolean" in str(error.limit):
+            continue
+        if (truth := truth_of(node.text)) is not None:
+            meant = replace(error, value=truth) if error.keyword == "type" else error
+            findings[ambiguous[node.span]] = finding(meant, tree)
 
 
 def _with_deep_keys(tree: Node, wrong: Container[Path], findings: list[Diagnostic]) -> Node:
@@ -255,7 +285,9 @@ def _bad_name(error: SchemaError, span: SourceSpan) -> Diagnostic:
     name = f"'{_clipped(str(error.value))}'"
     if not _is_chosen(error.path):
         return Diagnostic(span, Code.UNKNOWN_KEY, f"{name} {_expected(error)}")
-    return Diagnostic(span, Code.BAD_VALUE, f"the name {name} {_expected(error)}")
+    field, bracket, _ = str(error.value).partition("[")
+    hint = f"fill a list as a whole: `{field}: [a, b]`" if bracket and len(error.path) > _NAME_DEPTH else ""
+    return Diagnostic(span, Code.BAD_VALUE, f"the name {name} {_expected(error)}", hint)
 
 
 def _is_chosen(path: Path) -> bool:
@@ -268,7 +300,10 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
     key = key_at(tree, error.path)
     span = key.span if key else _first_line(node_at(tree, error.path))
     is_whole_part = len(error.path) == _NAME_DEPTH
-    hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part or not error.path else ""
+    is_known = is_whole_part or len(error.path) <= 1
+    hint = _HINTS_FOR_MISSING.get(missing, "") if is_known else ""
+    if error.path == ("record",) and {*mapping(node_at(tree, error.path)).entries} == {"last"}:
+        hint += "; add `continuous: false` to save only what 'last' keeps"
     if not error.path and missing in _BELONG_TOGETHER:
         hint = _HINT_FOR_WHOLE
     if (
@@ -278,6 +313,10 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
         and missing in ("topic", "endpoint")
     ):
         hint = "if its keys belong to the item above, remove the '-'"
+    if error.path[-1:] == ("deadman",) and missing == "send":
+        fields = "FIELD: VALUE"
+        stopping = fields if error.path[0] == "gateways" else f"CASE: {{{fields}}}"
+        hint = f"add the message that stops the rover: `send: {{{stopping}}}`"
     if is_whole_part and key:
         siblings = mapping(node_at(tree, error.path[:-1])).entries
         extended = [name for name, entry in siblings.items() if entry.key.span.file != key.span.file]

@@ -18,7 +18,7 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
 from router import inputs
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, plural, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, plural, shown_path
 from router.types.boards import framed_size, largest_beside, largest_encoding, longest, unbounded_fields
 from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
@@ -307,9 +307,8 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     descriptor = schema.descriptor(name)
     oneof = descriptor.oneofs_by_name.get(named.value)
     if oneof is None:
-        hint = did_you_mean(named.value, descriptor.oneofs_by_name)
         message = f"{name} has no oneof '{named.value}'"
-        raise TableError.of(named.span, Code.BAD_VALUE, message, hint)
+        raise TableError.of(named.span, Code.BAD_VALUE, message, _oneof_hint(schema, named.value))
     if scalars := [field for field in oneof.fields if field.message_type is None]:
         raise TableError([_scalar_finding(schema, field) for field in scalars])
     if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
@@ -326,6 +325,21 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     max_size = sum(bounded) if has_room_for_all else max(bounded, default=0)
     max_size += largest_beside(oneof, schema.board_options)
     return Envelope(name, oneof.name, schema.message_class(name), cases, max_size)
+
+
+def _oneof_hint(schema: ProtoSchema, name: str) -> str:
+    own = _oneofs(schema.descriptor(schema.envelope))
+    others = [each for each in schema.messages if name in _oneofs(schema.descriptor(each))]
+    if nearest(name, own) or not others:
+        alone = f"declare it: its members are the payload cases of {schema.envelope}"
+        return did_you_mean(name, own) or alone
+    known = f"{did_you_mean(name, own)}; " if own else ""
+    return f"{known}{others[0]} has it: write `message: {others[0]}` if that is the envelope"
+
+
+def _oneofs(message: Descriptor) -> list[str]:
+    """Return the names of the oneofs of a message, without those that stand for `optional`."""
+    return [name for name, each in message.oneofs_by_name.items() if name != f"_{each.fields[0].name}"]
 
 
 def _scalar_finding(schema: ProtoSchema, field: FieldDescriptor) -> Diagnostic:

@@ -19,7 +19,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import _protoc_compiler
 
 from router.assets import asset
-from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, did_you_mean, nearest, shown_path
+from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, nearest, shown_path
 from router.types.proto_files import NANOPB, Folder, declaring, scan
 from router.types.proto_source import ProtoText
 
@@ -61,7 +61,7 @@ def findings_of(complaints: Sequence[Complaint], folder: Folder) -> list[Diagnos
     for complaint in _without_consequences(complaints, folder.files.keys() | folder.faults.keys()):
         places.setdefault((complaint.file, complaint.line, complaint.column), []).append(complaint)
     for first, *more in places.values():
-        finding = _finding(first, folder.protos, texts[first.file])
+        finding = _finding(first, folder, texts[first.file])
         # Further messages about the same position are advice, or repetitions.
         advice = [_advice(other.message.rstrip(".")) for other in more if other.message != first.message]
         findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
@@ -107,13 +107,14 @@ def _without_consequences(complaints: Sequence[Complaint], names: Container[str]
         yield complaint
 
 
-def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) -> Diagnostic:
+def _finding(complaint: Complaint, folder: Folder, text: ProtoText) -> Diagnostic:
+    files = folder.protos
     if complaint.line < 0:
         return Diagnostic(SourceSpan(shown_path(text.path)), Code.BAD_PROTO, complaint.message.rstrip("."))
     span = text.word(complaint.line, complaint.column)
     if missing := _IMPORT_FAILED.fullmatch(complaint.message):
         others = files.keys() - {complaint.file, *scan(files.get(complaint.file, b"")).imports}
-        hint = _import_hint(missing["name"], complaint.file, others)
+        hint = _import_hint(missing["name"], complaint.file, others, folder.root)
         return Diagnostic(span, Code.BAD_PROTO, f"there is no file '{missing['name']}' to import", hint)
     if undefined := _NOT_DEFINED.match(complaint.message) or _NOT_IMPORTED.match(complaint.message):
         hint = _type_hint(undefined["name"], complaint.file, files)
@@ -136,15 +137,27 @@ def _advice(sentence: str) -> str:
     return sentence
 
 
-def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
-    """Return a hint with the file that is meant: beside the importer, of that name elsewhere, or a similar one."""
+_OF_GOOGLE = tuple(
+    f"google/protobuf/{name}.proto"
+    for name in ("any", "descriptor", "duration", "empty", "field_mask", "struct", "timestamp", "wrappers")
+)
+
+
+def _import_hint(name: str, importer: str, files: Collection[str], root: Path) -> str:
+    """Return a hint with the file that is meant: beside the importer, of that name elsewhere, or a similar one.
+
+    If there is none, the hint says where the file belongs.
+    """
     beside = posixpath.normpath(posixpath.join(posixpath.dirname(importer), name))
     same = [file for file in files if posixpath.basename(file).lower() == posixpath.basename(name).lower()]
     if beside in same:
         return f"imports are relative to the folder of the protos: write '{beside}'"
     if len(same) == 1:
         return f"did you mean '{same[0]}'?"
-    return did_you_mean(name, same or files)
+    if close := nearest(name, same or (*files, *_OF_GOOGLE)):
+        return f"did you mean '{close}'?"
+    return f"copy it into {shown_path(root)}, the folder that imports are relative to"
+
 
 
 def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:

@@ -41,7 +41,7 @@ def findings(folder: Path, *edits: tuple[str, str]) -> list[tuple[str, str]]:
         ("deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: \"'router'\"}}, ",
          "deadman: {timeout: 300 ms, manual_brake: {brake: true}, ",
          "put a payload case under 'send': `send: {manual_brake: ...}`"),
-        ("deadman: {none: nothing moves because of it}", "deadman: {none: true}", ""),
+        ("deadman: {none: nothing moves because of it}", "deadman: {none: true}", "say why in words: `none: TEXT`"),
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]", "{basestation: {max_rate: 5}}",
          "write a list: [{endpoint: basestation, ...}]"),
         ("[basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]",

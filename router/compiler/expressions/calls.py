@@ -21,7 +21,7 @@ def called_name(node: ast.Call, text: Parsed) -> str:
     if not isinstance(node.func, ast.Name):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
         known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
-        known = "write has(x)" if name == HAS else known
+        known = "write has(x)" if name == HAS else _of_each(node) or known
         hint = known or did_you_mean("", FUNCTIONS)
         message = "expressions can call only their own functions"
         raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, message, hint)
@@ -30,6 +30,15 @@ def called_name(node: ast.Call, text: Parsed) -> str:
         hint = f"write {FUNCTIONS[node.func.id].signature}" if node.func.id in FUNCTIONS else ""
         raise ExpressionError(text.span(node), Code.WRONG_ARGUMENTS, message, hint)
     return node.func.id
+
+
+def _of_each(node: ast.Call) -> str:
+    """Return a hint for `cells.map(mv)` and `cells.map(lambda cell: cell.mv)`; empty for anything else."""
+    if not (isinstance(node.func, ast.Attribute) and node.func.attr == "map" and len(node.args) == 1):
+        return ""
+    field = node.args[0].body if isinstance(node.args[0], ast.Lambda) else node.args[0]
+    name = field.attr if isinstance(field, ast.Attribute) else field.id if isinstance(field, ast.Name) else "FIELD"
+    return f"write {ast.unparse(node.func.value)}.{name} for this field of each element"
 
 
 def function_named(name: str, span: SourceSpan) -> Function:

@@ -52,7 +52,11 @@ def item_of(holder: Node, index: Node, span: SourceSpan, scope: Scope) -> Node:
     if element is None:
         raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {holder.kind} has no elements", "only lists can be indexed")
     if not isinstance(position, int) or isinstance(position, bool) or position < 0:
-        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index must be a literal integer, 0 or greater")
+        hint = "count from the first element, which is x[0]"
+        if length is not None and isinstance(position, int) and -length <= position < 0:
+            hint = f"for this element of {length}, write x[{length + position}]"
+        what = "an index must be a literal integer, 0 or greater"
+        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, what, hint)
     if length is not None and position >= length:
         raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} is out of range for {length} elements")
     if isinstance(holder, ListLiteral) and isinstance(element, MessageKind):

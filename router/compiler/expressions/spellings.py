@@ -74,6 +74,11 @@ class Slip(NamedTuple):
 def slip(text: str, names: Collection[str]) -> Slip | None:
     """Find a unit that is not in `names`, or an operator without an operand, in invalid text. Return None without."""
     bare = _QUOTED.sub(lambda quoted: "_" * len(quoted[0]), text)
+    if curly := _CURLY.search(bare):
+        quote = "'" if curly[0] in _SINGLE else '"'
+        is_all = len(_CURLY.split(text)) == 3 and not _CURLY.sub(" ", text[:1] + text[-1:]).strip()
+        hint = f"for text, write {{text: {text[1:-1]}}}" if is_all else f"replace it with {quote}, at both ends"
+        return Slip(curly.span(), f"'{curly[0]}' is a typographic quote", hint)
     for found in _UNIT.finditer(bare):
         unit = found["unit"]
         if unit not in names:
@@ -94,6 +99,8 @@ def _word_before(text: str) -> str:
 
 
 _DEGREES = ("degrees", "degree", "deg", "\u00b0")
+_SINGLE = "\u2018\u2019\u201a\u201b\u2032"
+_CURLY = re.compile(f"[{_SINGLE}\u201c-\u201f\u2033\u00ab\u00bb]")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 
 NULLS = ("null", "nil", "none", "undefined", "nullptr")
@@ -119,7 +126,8 @@ FUNCTIONS = {
     "atan": "write atan2(y, x)",
     "asin": "write atan2(x, sqrt(1 - x * x))",
     "acos": "write atan2(sqrt(1 - x * x), x)",
-    "map": "choose a value with {map: FIELD, VALUE: ..., else: ...}",
+    "map": "for a field of each element, write x.y; to choose a value, write {map: FIELD, VALUE: ..., else: ...}",
+    **dict.fromkeys(("size", "length", "count"), "write len(x)"),
     "received_at": "write it without brackets",
     "bool": "compare: x != 0",
     "constrain": "write clamp(x, low, high)",
