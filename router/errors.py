@@ -264,12 +264,23 @@ def shown_path(path: Path) -> str:
 
 
 def nearest_path(path: Path) -> Path | None:
-    """Return the file or folder that a missing path most likely stands for: a sibling with a similar name, or None."""
+    """Return the file or folder that a missing path most likely stands for: a sibling with a similar name, or None.
+
+    Between files of one kind, such as `*.yaml`, only what is before the suffix counts.
+    """
     try:
-        near = nearest(path.name, (other.name for other in path.parent.iterdir() if other != path))
+        siblings = [other for other in path.parent.iterdir() if other != path]
     except OSError:
         return None
-    return path.with_name(near) if near else None
+    alike = {other.stem: other for other in siblings if path.suffix and other.suffix == path.suffix}
+    if near := nearest(path.stem, alike):
+        return alike[near]
+    near = nearest(path.name, (other.name for other in siblings), _OTHER_KIND if path.suffix else 0.6)
+    return path.with_name(near) if near and near not in {other.name for other in alike.values()} else None
+
+
+_OTHER_KIND = 0.85
+"""Similarity required of a file with another suffix: `rover.ymal` is `rover.yaml`, `rover.mcap` is not."""
 
 
 def plural(count: int, noun: str) -> str:

@@ -68,7 +68,7 @@ _STEP = re.compile(r"(?P<name>\w+)(?:\[(?P<index>\d+)\])?")
 def _step(kind: MessageType, step: str, path: str) -> tuple[Field, int | None]:
     match = _STEP.fullmatch(step)
     if match is None:
-        raise UsageError(f"'{path}' is not a field path", "write it as x, bbox.x or points[0]")
+        raise UsageError(f"'{path}' is not a field path", "write it as x, bbox.x or points[0]: elements count from 0")
     field = kind.field(match["name"])
     if field is None:
         hint = did_you_mean(match["name"], (known.name for known in kind.fields))
@@ -84,12 +84,18 @@ def _inner_message(message: Any, field: Field, index: int | None, path: str) -> 
         member.SetInParent()
         return member
     if index is None:
-        raise UsageError(f"{path}: {field.name} is a list", f"name an element, such as {field.name}[0]")
+        element = path.replace(field.name, f"{field.name}[0]", 1)
+        raise UsageError(f"{path}: {field.name} is a list", f"name an element, such as {element}=...")
     _extend(member, field.type, index, path)
     return member[index]
 
 
 def _assign_element(values: Any, kind: List, index: int | None, path: str, text: str) -> None:
+    is_whole = index is None and not isinstance(kind.element, (String, Bytes)) and re.search(r"^\[|,", text)
+    if is_whole or (index is None and text and isinstance(kind.element, MessageType)):
+        member = f".{kind.element.fields[0].name}" if isinstance(kind.element, MessageType) else ""
+        hint = f"write each element: {path}[0]{member}=... {path}[1]{member}=..."
+        raise UsageError(f"{path} is a list, {kind}, and '{text}' is no element of it", hint)
     index = len(values) if index is None else index
     if isinstance(kind.element, MessageType) and not text:
         _extend(values, kind, index, path)

@@ -34,7 +34,7 @@ from router.shortage import (  # imported here: imports fail once memory is shor
     is_shortage,
 )
 
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Subparsers: TypeAlias = "argparse._SubParsersAction[_VerbParser]"
 
 OK = 0
 NETWORK_FAULT = 1
@@ -131,6 +131,16 @@ class _MainParser(argparse.ArgumentParser):
         return "\n".join([*lines, ""])
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """The parser of a verb. An error about missing arguments shows the `example` of a complete command."""
+
+    example = ""
+
+    def error(self, message: str) -> NoReturn:
+        hint = f"for example, `{self.example}`" if "are required" in message and self.example else ""
+        super().error(with_help(message, hint))
+
+
 class _Help(argparse.HelpFormatter):
     """Wraps paragraphs at the terminal's width, except those with indented lines (examples)."""
 
@@ -143,10 +153,10 @@ class _Help(argparse.HelpFormatter):
 
 def add_verb(
     subparsers: Subparsers, name: str, description: str, *examples: str, more: str = ""
-) -> argparse.ArgumentParser:
+) -> _VerbParser:
     """Add the parser of a verb, or of an action of a verb. Its help ends with `more`, then the examples."""
     shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
-    return subparsers.add_parser(
+    parser = subparsers.add_parser(
         name,
         help=VERBS.get(name) or description[0].lower() + description[1:].partition(". ")[0],
         description=description,
@@ -154,6 +164,8 @@ def add_verb(
         formatter_class=_Help,
         allow_abbrev=False,
     )
+    parser.example = examples[0]
+    return parser
 
 
 def with_help(what: str, hint: str = "") -> str:
@@ -219,7 +231,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = _MainParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
-    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
+    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_VerbParser)
     if "_ARGCOMPLETE" in os.environ:
         _complete(parser, subparsers)
     chosen = _verb(arguments)

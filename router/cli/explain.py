@@ -59,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--for works only with --live")
     if args.diff is not None and (args.names or args.table or args.code or args.live or args.given is not None):
         raise UsageError("--diff compares two whole tables and takes no other arguments")
+    if tables := [name for name in args.names if name.endswith((".yaml", ".yml"))]:
+        raise UsageError(f"{tables[0]} is a table, not a route or gateway", f"write `router explain -t {tables[0]}`")
     return _diff(*args.diff) if args.diff is not None else _explain(args)
 
 

@@ -79,9 +79,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _tests_of(path: Path) -> Path:
     """Return the test file beside a table; any other path unchanged. Raises UsageError or TableError."""
-    from router.rehearsal.reading import ENDINGS
+    from router.table.source import TEST_ENDINGS
 
-    if not path.is_file() or path.name.endswith(ENDINGS):
+    if not path.is_file() or path.name.endswith(TEST_ENDINGS):
         return path
     tests = path.with_name(f"{path.stem}.test{path.suffix}")
     if not tests.exists():

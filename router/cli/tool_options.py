@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from router import inputs
 from router.assets import asset
 from router.cli import DEFAULT_TABLE, with_help
-from router.errors import TableError, UsageError
+from router.errors import ConfigurationError, TableError, UsageError, did_you_mean_file
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
@@ -51,13 +51,21 @@ def table_path(args: argparse.Namespace) -> Path:
 
 
 def named_table(args: argparse.Namespace) -> Path | None:
-    """Return the table named on the command line or in the environment. Raises UsageError if two are on the former."""
+    """Return the table named on the command line, or else in the environment.
+
+    Raises UsageError if two are named on the command line, ConfigurationError if that of the environment is missing.
+    """
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and inputs.real_path(subject) != inputs.real_path(option):
         raise UsageError(f"two tables are named: {subject} and, with --table, {option}", "name only one")
-    of_environment = inputs.ENVIRONMENT.get(TABLE_VARIABLE)
-    return subject or option or (Path(of_environment) if of_environment else None)
+    if subject or option or not (of_environment := inputs.ENVIRONMENT.get(TABLE_VARIABLE)):
+        return subject or option
+    table = Path(of_environment)
+    if not inputs.exists(table):
+        what = f"there is no {of_environment}, the table that {TABLE_VARIABLE} names"
+        raise ConfigurationError(what, did_you_mean_file(of_environment, table) or "set it, or name a table with -t TABLE")
+    return table
 
 
 def table_if_any(args: argparse.Namespace) -> Path | None:

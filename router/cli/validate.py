@@ -65,5 +65,7 @@ def find_tables(paths: Sequence[Path]) -> list[Path]:
 
 
 def _is_table(file: Path) -> bool:
-    is_yaml = file.suffix in (".yaml", ".yml") and not file.name.endswith((".test.yaml", ".test.yml"))
+    from router.table.source import TEST_ENDINGS
+
+    is_yaml = file.suffix in (".yaml", ".yml") and not file.name.endswith(TEST_ENDINGS)
     return is_yaml and not file.name.startswith(".") and not file.is_dir()

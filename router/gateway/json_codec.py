@@ -297,12 +297,15 @@ def decoder(message: MessageType, style: Style) -> Decode:
         try:
             writing.write(data, message, read(text), "")
         except (msgspec.ValidationError, UnicodeError, InvalidMessageError) as error:
-            raise InvalidMessageError(shown(str(error))) from None
+            remedy = "; send every field of the message" if str(error).startswith(_MISSING) else ""
+            raise InvalidMessageError(shown(str(error)) + remedy) from None
         return HEADER + data
 
     return decode
 
 
+_MISSING = "Object missing required field"
+"""The beginning of msgspec's error for a missing field."""
 _AnyJson = msgspec.json.Decoder(msgspec.Raw)
 
 

@@ -87,7 +87,10 @@ class HeadStart:
 
     def _open_sockets(self, parts: Mapping[str, Any]) -> None:
         for name, address, interface, receive_buffer in parts["listeners"]:
-            self.listening[name] = ListeningSocket(address, interface, receive_buffer)
+            try:
+                self.listening[name] = ListeningSocket(address, interface, receive_buffer)
+            except OSError as error:
+                raise OSError(error.errno, f"listener '{name}' cannot be opened: {error.strerror}") from error
         every = [*self.listening.values()]
         for name, address, is_board, source_name in parts["senders"]:
             source = placed(self.listening.get(source_name), every)
@@ -240,4 +243,5 @@ def _attempt() -> HeadStartAttempt:
         return HeadStartAttempt(HeadStart(kept))
     except Exception as error:  # noqa: BLE001 - after any error, the router starts without it and logs why
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        return HeadStartAttempt(None, f"{type(error).__name__}: {error}")
+        why = error.strerror if isinstance(error, OSError) else None
+        return HeadStartAttempt(None, why or f"{type(error).__name__}: {error}")

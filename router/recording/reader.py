@@ -20,7 +20,7 @@ from mcap.records import Channel, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from router.datagrams import Peer
-from router.errors import UsageError
+from router.errors import UsageError, did_you_mean_file
 from router.recording.channels import Datagram, Event, Holds
 from router.recording.mirror import Action
 from router.recording.schemas import RecordedCase
@@ -83,7 +83,9 @@ class Recording:
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from error
+            hint = did_you_mean_file(str(path), path) or f"paths are relative to the working directory, {Path.cwd()}"
+            is_missing = isinstance(error, FileNotFoundError)
+            raise UsageError(f"{path}: {error.strerror}", hint if is_missing and not path.is_absolute() else "") from error
         self.size = os.fstat(self._file.fileno()).st_size  # the file may be removed meanwhile
         try:
             self._find_metadata()

@@ -18,10 +18,11 @@ from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import STAMP_TYPES
 from router.errors import Code, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
+from router.table.compose import resolve
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
-from router.types.model import Bytes, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
 from router.values import ZEROS, parse, scalar_text
 
 ANY = "any"
@@ -167,9 +168,13 @@ class FieldReader:
         field = kind.field(name)
         if field is None:
             hint = did_you_mean(name, [member.name for member in kind.fields])
+            if kind.field(name.partition("[")[0]):
+                hint = "write a list as a whole: [a, b]"
             raise invalid(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
         if dot and not isinstance(field.type, MessageType):
-            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
+            is_list = isinstance(field.type, List) and isinstance(field.type.element, MessageType)
+            hint = f"write its elements: {name}: [{{{rest}: VALUE}}]" if is_list else ""
+            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields", hint)
         inner = members.get(name)
         if inner is not None and not (dot and isinstance(inner, Fields)):
             raise invalid(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
@@ -204,6 +209,7 @@ class FieldReader:
 
     def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
         text = node.text
+        _refuse_other_type(kind, node)
         if isinstance(kind, (Int, Float)) and not self._exact and (near := _near(text, node.span)):
             return near
         if isinstance(kind, Int) and (number := self._constant(text, holder, node.span)) is not None:
@@ -225,6 +231,16 @@ class FieldReader:
             message = f"several enums have a value '{text}', with different numbers"
             raise invalid(span, Code.BAD_VALUE, message, f"name the enum, as in State.{text}")
         return next(iter(numbers), None)
+
+
+def _refuse_other_type(kind: Type, node: ScalarNode) -> None:
+    """Raise InvalidValueError for a quoted number or truth value, and for a number in place of a truth value."""
+    if isinstance(kind, (Bool, Int, Float)) and isinstance(node.value, str) and not isinstance(resolve(node.text), str):
+        hint = f"write it without quotes: {node.text}"
+        raise invalid(node.span, Code.WRONG_TYPE, f"the text '{node.text}' is not a {kind}", hint)
+    if isinstance(kind, Bool) and not isinstance(node.value, bool):
+        hint = {0: "write false", 1: "write true"}.get(node.value, "write true or false")
+        raise invalid(node.span, Code.WRONG_TYPE, f"'{node.text}' is not a bool", hint)
 
 
 def _near(text: str, span: SourceSpan) -> Scalar | None:

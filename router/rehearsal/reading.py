@@ -29,12 +29,11 @@ from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode, is_v
 from router.table.reading import InvalidValueError, mapping, parsed
 from router.table.schema import schema_errors
 from router.table.shape import finding, subject, unknown_keys
-from router.table.source import read_source
+from router.table.source import TEST_ENDINGS, read_source
 from router.table.units import parse_duration
 
 R = TypeVar("R")
 
-ENDINGS = (".test.yaml", ".test.yml")
 SCHEMA = "schemas/table-test.schema.json"
 
 
@@ -65,7 +64,7 @@ def find_test_files(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
             try:
-                found = sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS) and file.name[0] != ".")
+                found = sorted(file for file in path.iterdir() if file.name.endswith(TEST_ENDINGS) and file.name[0] != ".")
             except OSError as error:
                 raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
             files.update(dict.fromkeys(found))
@@ -105,7 +104,7 @@ def _table_of(root: MappingNode, path: Path) -> Path:
             message = f"there is no table '{named.text}' beside this file"
             raise TableError([Diagnostic(named.span, Code.BAD_FILE, message, did_you_mean_file(named.text, table))])
         return table
-    for ending in ENDINGS:
+    for ending in TEST_ENDINGS:
         if path.name.endswith(ending):
             table = path.with_name(path.name.removesuffix(ending) + ending.removeprefix(".test"))
             if table.is_file():
@@ -240,7 +239,7 @@ def _schema_findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnosti
     for error in errors:
         if error.keyword == "additionalProperties":
             owner = subject(error.path) if error.path else "a test file"
-            yield from unknown_keys(root, error.path, list(error.schema["properties"]), owner, empty)
+            yield from unknown_keys(root, error.path, list(error.schema["properties"]), owner, empty, SCHEMA)
         elif not error.path and error.path not in misspelt:
             yield Diagnostic(whole, Code.MISSING_KEY, "the test file has no key 'tests'")
         elif error.keyword == "required" and error.path in misspelt:

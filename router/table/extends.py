@@ -15,13 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from router import inputs
-from router.errors import Code, Diagnostic, TableError, did_you_mean_file, shown_path
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean_file, shown_path
 from router.table.compose import compose
 from router.table.hints import as_variable
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.reading import is_choice
-from router.table.source import UNREADABLE, Source, read_source
+from router.table.source import TEST_ENDINGS, UNREADABLE, Source, read_source
 
 KEY = "extends"
 IGNORE = "ignore"
@@ -52,7 +52,7 @@ def load_chain(
     reference: ScalarNode | None = None
     while True:
         seen.append(inputs.real_path(path))
-        source = read_source(path) if reference is None else _read_base(path, reference)
+        source = _read_table(path) if reference is None else _read_base(path, reference)
         sources.append(source)
         layers.append(_root_mapping(compose(source, environ, findings)))
         reference = _reference(layers[-1])
@@ -123,6 +123,15 @@ def _reference(root: MappingNode) -> ScalarNode | None:
         span = node.span if isinstance(node, ScalarNode) and node.text else entry.key.span
         raise TableError.of(span, Code.WRONG_TYPE, f"'{KEY}' must be the path of another table")
     return node
+
+
+def _read_table(path: Path) -> Source:
+    """Read the file of a table. Raises TableError if it cannot be read, or has table tests."""
+    if path.name.endswith(TEST_ENDINGS):
+        file = shown_path(path)
+        what = "this file has tests of a table, it is not a table"
+        raise TableError.of(SourceSpan(file), Code.BAD_FILE, what, f"run them with `router test {file}`")
+    return read_source(path)
 
 
 def _read_base(path: Path, reference: ScalarNode) -> Source:

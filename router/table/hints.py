@@ -20,7 +20,7 @@ from router.table.nodes import (
     node_at,
     to_data,
 )
-from router.table.schema import SchemaError, keys_of, matches, table_schema
+from router.table.schema import SCHEMA, SchemaError, keys_of, matches, table_schema
 from router.table.source import in_braces
 from router.table.units import EACH, PERIOD, TOPIC_RATE, meant_quantity
 
@@ -61,6 +61,8 @@ _ELSEWHERE = {
     "times": ("count", "repeat"),
     "from": ("source", "sender"),
     "case": ("payload", "type"),
+    "published": ("topic", "topics", "publishes"),
+    "sent": ("destination", "destinations", "forwarded"),
 }
 """Our keys, with their names in other programs."""
 ADDRESS_PARTS = ("ip", "host", "port")
@@ -127,8 +129,8 @@ _NAMED = {"topics": "topic", "destinations": "endpoint"}
 """Lists of mappings that people write as one mapping, and the key that names an item."""
 
 
-def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
-    """Return a hint for an unknown key, with this value, of the mapping at `path`."""
+def for_key(name: str, value: Node, path: Path, known: list[str], schema: str = SCHEMA) -> str:
+    """Return a hint for an unknown key, with this value, of the mapping at `path`; `schema` is that of the file."""
     if words := for_common_mistake(name, known):
         return words
     if is_topics_of_source(name, path):
@@ -139,7 +141,7 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
         return f"put a payload case under 'send': `send: {{{name}: ...}}`"
-    if owners := _owners(name, path):
+    if schema == SCHEMA and (owners := _owners(name, path)):
         return owners
     if path[:1] == ("routes",) and (key := _NAMED.get(str(path[-1]))):
         is_listed = isinstance(value, ScalarNode) and value.value is None

@@ -182,9 +182,9 @@ def _rests(node: MappingNode) -> set[str]:
 
 
 def unknown_keys(
-    tree: Node, path: Path, known: list[str], owner: str, empty: Container[Path] = ()
+    tree: Node, path: Path, known: list[str], owner: str, empty: Container[Path] = (), schema: str = SCHEMA
 ) -> Iterator[Diagnostic]:
-    """Yield a finding for each key of the mapping at `path` that is not `known`.
+    """Yield a finding for each key of the mapping at `path` that is not `known`. `schema` is that of the file.
 
     Keys after one of the paths in `empty` are not reported: they belong below it and are not indented.
     """
@@ -200,7 +200,7 @@ def unknown_keys(
         written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
         free = [key for key in known if key not in written]
         advice = hints.behind(name, entry, before) or hints.for_common_mistake(name, known)
-        hint = advice or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known)
+        hint = advice or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known, schema)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
         said.add(hints.for_common_mistake(name, known) or None)

@@ -15,6 +15,8 @@ from router import inputs
 from router.assets import asset, is_installed
 from router.errors import Code, SourceSpan, TableError, nearest, nearest_path, shown_path
 
+TEST_ENDINGS = (".test.yaml", ".test.yml")
+"""What the names of files with table tests end in."""
 MAX_BYTES = 4 << 20
 UNREADABLE = "the file cannot be read: "
 _LINE_END = re.compile(r"\r\n|\r|\n")

@@ -32,6 +32,7 @@ def destination(text: str, table: RouteTable | None) -> Address:
     host, colon, port = text.rpartition(":")
     if not colon or not host:
         raise _not_a_place(text, table, "HOST:PORT")
+    _refuse_port_of_name(host, text, table)
     return Address(_resolve(host), _port(port, lowest=1))
 
 
@@ -42,6 +43,7 @@ def listening(text: str, table: RouteTable | None) -> Address:
     host, _, port = text.rpartition(":")
     if not port.isdigit():
         raise _not_a_place(text, table, "[HOST:]PORT")
+    _refuse_port_of_name(host, text, table)
     return Address(_resolve(host) if host else ANY_HOST, _port(port, lowest=0))
 
 
@@ -53,6 +55,8 @@ def origin(text: str, table: RouteTable | None) -> Address:
     host, colon, port = text.partition(":")
     if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
         raise _not_a_place(text, table, "HOST[:PORT]")
+    if colon:
+        _refuse_port_of_name(host, text, table)
     return Address(_resolve(host), _port(port, lowest=0) if colon else 0)
 
 
@@ -111,6 +115,14 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
         return None
     named = table.endpoints.get(text) or table.listeners.get(text)
     return None if named is None else named.address.value
+
+
+def _refuse_port_of_name(host: str, text: str, table: RouteTable | None) -> None:
+    """Raise UsageError for a name of the table with a port, such as `sensor_board:5001`."""
+    if (named := _named(host, table)) is not None:
+        _, _, port = text.rpartition(":")
+        hint = f"write {host} alone, or its host with another port: {named.host}:{port}"
+        raise UsageError(f"'{host}' is a name of the route table, which takes no port", hint)
 
 
 def _not_a_place(text: str, table: RouteTable | None, form: str) -> UsageError:

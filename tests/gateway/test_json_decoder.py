@@ -185,8 +185,12 @@ POSES = [POSE, POSE, {"position": ZERO, "orientation": ZERO | {"w": None}}]
     ("declared", "value", "expected"),
     [
         (TWIST, {"linear": ZERO | {"x": "abc"}, "angular": ZERO}, "Expected `float`, got `str` - at `$.linear.x`"),
-        (TWIST, {"linear": ZERO}, "Object missing required field `angular`"),
-        (TWIST, {"linear": {"x": 1, "z": 1}, "angular": ZERO}, "Object missing required field `y` - at `$.linear`"),
+        (TWIST, {"linear": ZERO}, "Object missing required field `angular`; send every field of the message"),
+        (
+            TWIST,
+            {"linear": {"x": 1, "z": 1}, "angular": ZERO},
+            "Object missing required field `y` - at `$.linear`; send every field of the message",
+        ),
         (
             TWIST,
             {"linear": ZERO | {"w": 1}, "angular": ZERO},
