@@ -246,6 +246,8 @@ class _Composer:
 
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
         hint = "remove it; to make a value text, quote it"
+        if "include" in name:
+            hint = "put what tables share into one table, which the others name in `extends: FILE`"
         if (found := exclamation(self._source, span.line - 1)) is not None:
             self._findings.append(found)
             return True

@@ -127,7 +127,7 @@ def _reference(root: MappingNode) -> ScalarNode | None:
 
 def _read_table(path: Path) -> Source:
     """Read the file of a table. Raises TableError if it cannot be read, or has table tests."""
-    if path.name.endswith(TEST_ENDINGS):
+    if path.name.endswith(TEST_ENDINGS) and inputs.exists(path):
         file = shown_path(path)
         what = "this file has tests of a table, it is not a table"
         raise TableError.of(SourceSpan(file), Code.BAD_FILE, what, f"run them with `router test {file}`")

@@ -65,6 +65,8 @@ _ELSEWHERE = {
     "sent": ("destination", "destinations", "forwarded"),
 }
 """Our keys, with their names in other programs."""
+ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
+"""Keys whose value is an address."""
 ADDRESS_PARTS = ("ip", "host", "port")
 _COMMON_MISTAKES = (
     ("address", ADDRESS_PARTS, "write the IP address and port together: `address: 192.168.0.30:8`"),
@@ -77,6 +79,7 @@ _COMMON_MISTAKES = (
     ("package", ("timeout", "repeat"), "write `deadman: {timeout: 500ms, repeat: 100ms}`"),
     ("repeat", ("send", "at_start"), "set it in each deadman"),
     ("obeyed", ("within",), "move it into 'obeyed': `obeyed: {CASE: CONDITION, within: 2s}`"),
+    ("transport", ("address", "port"), "write it in 'transport': `transport: {websocket: 0.0.0.0:8765}`"),
     ("record", ("directory", "continuous", "last", "rotate_after", "retention"), "move it into 'record'"),
     ("rotate_after", ("size", "age"), "move it into 'rotate_after'"),
     ("http", ("address",), "move it into the part that it is the address of: 'http', 'foxglove' or a listener"),
@@ -123,6 +126,16 @@ def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
     if key in NAME_FIELDS and isinstance(written, MappingNode) and is_below:
         return f"if it is a key of '{key}', indent it like the others"
     return ""
+
+
+def of_topic(name: str, entry: Entry, entries: Mapping[str, Entry]) -> str:
+    """Return a hint for a key of a topic, such as `type`, that is beside `topic: NAME` of a route; empty without."""
+    topic = entries.get("topic")
+    keys = keys_of(table_schema()["definitions"]["topic"]) - keys_of(table_schema()["definitions"]["route"])
+    if name not in keys or topic is None or not isinstance(topic.value, ScalarNode) or "source" not in entries:
+        return ""
+    value = _in_flow(to_data(entry.value)) or "..."
+    return f"move it into 'topic': `topic: {{topic: {topic.value.text}, {name}: {value}}}`"
 
 
 _NAMED = {"topics": "topic", "destinations": "endpoint"}
@@ -296,6 +309,7 @@ _INSTEAD: Mapping[Path, str] = {
     ("endpoints", "*"): "{{address: {0}, kind: board}}",
     ("gateways", "*", "transport", "zenoh"): "{{key: {0}}}",
     ("node",): "{{name: {0}}}",
+    ("envelope",): "{{message: {0}, oneof: payload}}",
     ("record",): "{{directory: {0}}}",
     ("defaults", "deadman"): "{{timeout: {0}}}",
     ("routes", "*", "deadman"): "{{timeout: {0}, send: {{CASE: {{FIELD: VALUE}}}}}}",
@@ -305,6 +319,7 @@ _INSTEAD: Mapping[Path, str] = {
 """Mappings that people write as a single value, and what to write instead."""
 
 _WORDS: Mapping[tuple[Path, str], str] = {
+    (("reload",), "on_change"): "write `reload: {on_change: true}`",
     (("routes", "*", "deadman"), "none"): "write `deadman: {none: why}`",
     (("gateways", "*", "topics"), "*"): "leave 'topics' out to send every topic",
     (("gateways", "*", "topics"), "all"): "leave 'topics' out to send every topic",
@@ -391,7 +406,7 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     if hint := _for_collection(error, value) or _with_unit(error, value):
         return hint
     if _is_at(error.path[-3:], ("deadman", "send", "*")):
-        return without_case({name: value})
+        return _case_or_field(name, value)
     if (written := _in_flow(value)) is None:
         return ""
     if instead := next((text for place, text in _INSTEAD.items() if _is_at(error.path, place)), ""):
@@ -403,6 +418,8 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     if error.limit == "array":
         is_address = "zenoh" in error.path and re.fullmatch(r"[\w.-]+:\d+", written)
         return f"write `{name}: [{'tcp/' if is_address else ''}{written}]`"
+    if error.limit == "string" and isinstance(value, int) and name in ADDRESSES:
+        return f"write `{name}: IP:{written}`"
     if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
         return f'quote it: "{written}"'
     return ""
@@ -410,7 +427,7 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
 
 def _for_truth(path: Path, value: bool) -> str:
     if _is_at(path[-3:], ("deadman", "send", "*")):
-        return without_case({str(path[-1]): value})
+        return _case_or_field(str(path[-1]), value)
     if path in _ON:
         return f"write `{path[0]}: {_ON[path]}`" if value else f"leave '{path[0]}' out"
     if path[-1:] == ("deadman",) and path[:1] == ("routes",) and not value:
@@ -418,12 +435,15 @@ def _for_truth(path: Path, value: bool) -> str:
     return _AUTO if value and path[-1:] == ("fields",) else ""
 
 
-def without_case(fields: Mapping[str, object]) -> str:
-    """Return a hint for fields directly below `send` of a deadman, without a payload case; empty for anything else."""
-    written = [f"{name}: {shown}" for name, value in fields.items() if (shown := _in_flow(value)) is not None]
-    if len(written) < len(fields):
+def _case_or_field(name: str, value: object) -> str:
+    """Return a hint for a value under `send` of a deadman that has a payload case or a field, but not both."""
+    if (written := _in_flow(value)) is None:
         return ""
-    return f"put a payload case under 'send', and its fields under that: `send: {{CASE: {{{', '.join(written)}}}}}`"
+    written = f"[{written}]" if isinstance(value, list) else written
+    case, dot, field = name.partition(".")
+    if dot:
+        return f"write `{case}: {{{field}: {written}}}`"
+    return f"if '{name}' is a payload case, write `{name}: {{FIELD: {written}}}`; if it is a field, `CASE: {{{name}: {written}}}`"
 
 
 def _is_of(kinds: str | list[str], value: object) -> bool:
@@ -434,7 +454,7 @@ def _is_of(kinds: str | list[str], value: object) -> bool:
 
 def _for_collection(error: SchemaError, value: object) -> str:
     if isinstance(value, dict) and error.limit == "array":
-        return "start each item with '-'"
+        return f"start each item with '-', or write `{error.path[-1]}: [{{...}}]`"
     if not isinstance(value, list):
         return ""
     if error.path in _BY_NAME:

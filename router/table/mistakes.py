@@ -30,6 +30,7 @@ class _Advice(NamedTuple):
 
 _TAB = _Advice("this line is indented with a tab", "indent with spaces")
 _OPEN_QUOTE = _Advice("this quote is not closed on its line", at_start=True)
+_UNENDING = "found unexpected end of stream"
 _NO_KEY_ENDS = "could not find expected ':'"
 _NO_KEY = "did not find expected key"
 _NO_DASH = "did not find expected '-' indicator"
@@ -46,7 +47,6 @@ _ADVICE = {
         problem: _Advice(f"this '{opening}' is not closed by a '{closing}', or a ',' is missing inside", at_start=True)
         for problem, (opening, closing) in _NOT_CLOSED.items()
     },
-    "found unexpected end of stream": _OPEN_QUOTE,
     "found unexpected document indicator": _OPEN_QUOTE,
     "found unknown escape character": _Advice(
         "unknown backslash sequence", "use single quotes, which keep backslashes as they are"
@@ -134,6 +134,8 @@ def explain(
         return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
     if slip := _slip(source, line) or exclamation(source, line):
         return slip
+    if error.problem == _UNENDING and error.context_mark:
+        return _finding(source, error.context_mark.line, error.context_mark.column, _OPEN_QUOTE)
     if open_bracket and not any(text.strip() for text in source.lines[line:]):
         return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
     written = source.lines[line] if line < len(source.lines) else ""
@@ -156,7 +158,7 @@ def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnos
     return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
 
 
-_EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?=[ ,}\]]|$))))")
+_EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?= *(?:[,}\]<>=]|$|(?:and|or|if)\b)))))")
 _NO_EXCLAMATION = "a value cannot start with '!'"
 
 
@@ -194,7 +196,8 @@ def _slip(source: Source, line: int) -> Diagnostic | None:
             plain = unicodedata.normalize("NFKC", character.translate(_ASCII))
             name = unicodedata.name(character, "").lower()
             what = f"the character U+{ord(character):04X} ({name}) is not allowed here"
-            hint = f"replace it with '{plain}'" if plain.isascii() else "remove it"
+            quote = '"' if plain == "'" else "'"
+            hint = f"replace it with {quote}{plain}{quote}" if plain.isascii() else "remove it"
             return _finding(source, number, match.start(match.lastgroup or 0), _Advice(what, hint))
     return None
 

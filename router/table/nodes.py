@@ -206,6 +206,9 @@ _INDISPENSABLE = frozenset({
 })  # fmt: skip
 """Keys without which a route, topic, destination, deadman, `collect` or gateway is meaningless."""
 
+_WHOLE = ("obeyed",)
+"""Keys whose mapping is meaningless if any part of it is invalid."""
+
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 """Sets of keys, any of which makes a mapping worth checking even if other keys are missing."""
 
@@ -246,7 +249,7 @@ def _valid_mapping(node: MappingNode) -> MappingNode | None:
 
 def _valid_entry(entry: Entry) -> Entry | None:
     """Return the valid part of an entry; None if it is broken as a whole, for example a mapping in place of a list."""
-    if entry.value.broken:
+    if entry.value.broken or entry.key.text in _WHOLE:
         return None
     if entry.key.text == "fields" and not entry.key.broken:
         fields = _valid_fields(entry.value)

@@ -27,8 +27,6 @@ _TYPES = {
     "boolean": "true or false",
 }
 _LONGEST = 60
-_ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
-"""Keys whose value is an address."""
 _NAME_DEPTH = len(("endpoints", "name"))
 _NAMED_PARTS = {
     "listen": ("listener", "a"),
@@ -42,7 +40,9 @@ _HINTS_FOR_MISSING = {
     "kind": "add `kind: board`, `kind: basestation` or `kind: tool`",
     "transport": "add it, or write 'ignore: why'",
     "version": "start with 'version: 1'",
-    "receive": "add the local address that receives what its client publishes",
+    "message": "name the protobuf message of each datagram, as in `message: PBEnvelope`",
+    "oneof": "name the oneof whose members are the payload cases, as in `oneof: payload`",
+    "receive": "add the local address that receives what its client publishes: `receive: IP:PORT`",
     "directory": "add the folder for recordings, as in `directory: ../recordings`",
 }
 _BELONG_TOGETHER = ("envelope", "listen", "routes")
@@ -199,7 +199,8 @@ def unknown_keys(
             continue
         written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
         free = [key for key in known if key not in written]
-        advice = hints.behind(name, entry, before) or hints.for_common_mistake(name, known)
+        advice = hints.behind(name, entry, before) or hints.of_topic(name, entry, entries)
+        advice = advice or hints.for_common_mistake(name, known)
         hint = advice or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known, schema)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
@@ -218,6 +219,8 @@ def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
             broken = True  # the key's content is lost
         else:
             entries[meant] = entry
+    if any(hints.of_topic(name, entry, written.entries) for name, entry in written.entries.items()):
+        entries["topic"] = replace(entries["topic"], value=_as_broken(entries["topic"].value))
     if "address" in entries and any(name in written.entries for name in hints.ADDRESS_PARTS):
         entries["address"] = replace(entries["address"], value=_as_broken(entries["address"].value))
     return replace(written, entries=entries, broken=broken)
@@ -239,7 +242,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     if keyword == "type":
         what = f"{name} {_expected(error)}, not {shown(error.value)}"
         return Diagnostic(span, Code.WRONG_TYPE, what, hints.for_type(error, tree))
-    if keyword == "pattern" and path[-1] in _ADDRESSES:
+    if keyword == "pattern" and path[-1] in hints.ADDRESSES:
         return _bad_address(str(error.value), span)
     if keyword == "uniqueItems":
         return _repeated(error, tree)

@@ -383,6 +383,7 @@ IN_SHAPE = [
     ("{expects: nothing}", Code.UNKNOWN_KEY, "no key 'expects'"),
     ("{expect: sent}", Code.BAD_VALUE, "'expect' must be 'nothing', 'any', or a mapping"),
 ]
+TEXT = "{accel_x: '1.5'}"
 IN_MEANING = [
     (
         "{given: {case: imu, from: sensor_board, listener: exact}, expect: nothing}",
@@ -395,6 +396,8 @@ IN_MEANING = [
     ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
     (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
     (f"{{given: {given('{accel_x: 1e39}')}, expect: nothing}}", Code.BAD_VALUE, "does not fit float32"),
+    (f"{{given: {given(TEXT)}, expect: nothing}}", Code.WRONG_TYPE, "the text '1.5' is not a float32"),
+    (f"{{given: {given('{is_calibrated: 1}')}, expect: nothing}}", Code.WRONG_TYPE, "'1' is not a bool"),
     (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
     ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
     ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),

@@ -66,6 +66,18 @@ def test_a_mistake_is_found_once_with_what_to_write(written: str, instead: str, 
     assert [said for _, said in findings(tmp_path, (written, instead))] == [hint]
 
 
+@pytest.mark.parametrize(
+    ("written", "instead"),
+    [
+        ("source_port: 9", 'source_port: "${NOWHERE:-9}"'),
+        ("kind: board, source_port: 9}", 'kind: board, source_port: 9, trim_trailing_zeros: "${NOWHERE:-false}"}'),
+        ("{ignore: nobody needs it}", "{ignore: '${NOWHERE:-7}'}"),
+    ],
+)
+def test_a_value_with_a_variable_has_the_type_that_its_key_takes(written: str, instead: str, tmp_path: Path) -> None:
+    assert findings(tmp_path, (written, instead)) == []
+
+
 def test_words_that_a_key_takes_are_named(tmp_path: Path) -> None:
     said = "'priority' must be one of 'command', 'telemetry', 'bulk', not the number 1"
     assert findings(tmp_path, ("priority: command", "priority: 1")) == [(said, "")]

@@ -188,14 +188,21 @@ def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -
     return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, "expressions have no null", hint)
 
 
+_LENGTHS = ("length", "size", "count")
+
+
 def member_of(holder: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> Node:
     """Resolve `holder.name`. For a list of messages, it is a list: this field of each element."""
     span = text.span(node)
-    if isinstance(element_of(holder.kind), MessageKind):
+    element = element_of(holder.kind)
+    if isinstance(element, MessageKind) and (node.attr not in _LENGTHS or element.type.field(node.attr)):
         return elementwise(lambda parts: _of_element(parts[0], node, text, scope), [holder], span, scope)
     if not isinstance(holder.kind, MessageKind):
-        is_time = isinstance(holder.kind, TimeKind)
-        hint = "convert a time with seconds(x)" if is_time else f"remove '.{node.attr}': only messages have fields"
+        hint = f"remove '.{node.attr}': only messages have fields"
+        if isinstance(holder.kind, TimeKind):
+            hint = "convert a time with seconds(x)"
+        elif element is not None and node.attr in _LENGTHS:
+            hint = f"write len({ast.unparse(node.value)})"
         raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:

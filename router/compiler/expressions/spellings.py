@@ -109,6 +109,8 @@ NAMES = {
     **dict.fromkeys(("pi", "m_pi"), "write 3.141592653589793; radians(x) and degrees(x) convert angles"),
     **dict.fromkeys(("now", "time", "stamp", "timestamp"), ARRIVAL),
     **dict.fromkeys(("infinity", "infinityf"), "write inf"),
+    **dict.fromkeys(("yes", "on"), "write true"),
+    **dict.fromkeys(("no", "off"), "write false"),
     "static_cast": FLOAT,
     "header": ARRIVAL,
 }
@@ -129,6 +131,9 @@ FUNCTIONS = {
     "map": "for a field of each element, write x.y; to choose a value, write {map: FIELD, VALUE: ..., else: ...}",
     **dict.fromkeys(("size", "length", "count"), "write len(x)"),
     "received_at": "write it without brackets",
+    "range": "compare: 0 <= x < 3",
+    "list": "leave it out: fields and [a, b] are lists",
+    "tofixed": DECIMALS,
     "bool": "compare: x != 0",
     "constrain": "write clamp(x, low, high)",
     **dict.fromkeys(("rad", "deg2rad", "to_radians", "degtorad"), "write radians(x)"),

@@ -173,6 +173,7 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.BitOr: spellings.BITS.format("or"),
     ast.Invert: spellings.BITS.format("not"),
     ast.Lambda: "write its body alone",
+    ast.Dict: "write a map of values without quotes: {map: FIELD, VALUE: ..., else: ...}",
     **dict.fromkeys((ast.ListComp, ast.GeneratorExp, ast.SetComp, ast.DictComp), _WITHOUT_LOOP),
     ast.NamedExpr: "write the value alone: expressions cannot assign",
     ast.JoinedStr: "join strings with +, str() and text()",
