@@ -112,8 +112,20 @@ def test_lists_are_appended_to_or_set_by_index_and_later_words_win(every_kind: P
         ("point=3", "point is the message Point; set its fields, such as point.x=..."),
         ("flag.x=1", "flag of EveryKind is bool, which has no fields"),
         ("flag[0]=1", "flag[0]: flag is bool, not a list"),
-        ("numbers=[1,2]", "numbers is a list, int32[], and '[1,2]' is no element of it; write each element: numbers[0]=... numbers[1]=..."),
-        ("points=3", "points is a list, EveryKind.Point[], and '3' is no element of it; write each element: points[0].x=... points[1].x=..."),
+        (
+            "numbers=[1,2]",
+            (
+                "numbers is a list, float32[], and '[1,2]' is no element of it; "
+                "write each element: numbers[0]=... numbers[1]=..."
+            ),
+        ),
+        (
+            "points=3",
+            (
+                "points is a list, Point[], and '3' is no element of it; "
+                "write each element: points[0].x=... points[1].x=..."
+            ),
+        ),
         ("points.x=1", "points.x: points is a list; name an element, such as points[0].x=..."),
         ("numbers[99999]=1", "numbers[99999]: float32[] holds at most 65507 elements"),
         ("a b=1", "'a b' is not a field path; write it as x, bbox.x or points[0]: elements count from 0"),

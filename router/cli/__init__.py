@@ -151,9 +151,7 @@ class _Help(argparse.HelpFormatter):
         )
 
 
-def add_verb(
-    subparsers: Subparsers, name: str, description: str, *examples: str, more: str = ""
-) -> _VerbParser:
+def add_verb(subparsers: Subparsers, name: str, description: str, *examples: str, more: str = "") -> _VerbParser:
     """Add the parser of a verb, or of an action of a verb. Its help ends with `more`, then the examples."""
     shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
     parser = subparsers.add_parser(

@@ -64,7 +64,9 @@ def named_table(args: argparse.Namespace) -> Path | None:
     table = Path(of_environment)
     if not inputs.exists(table):
         what = f"there is no {of_environment}, the table that {TABLE_VARIABLE} names"
-        raise ConfigurationError(what, did_you_mean_file(of_environment, table) or "set it, or name a table with -t TABLE")
+        where = "" if table.is_absolute() else f" from {Path.cwd()}"
+        how = f"set it to a path that exists{where}, or name a table with -t TABLE"
+        raise ConfigurationError(what, did_you_mean_file(of_environment, table) or how)
     return table
 
 

@@ -243,5 +243,5 @@ def _attempt() -> HeadStartAttempt:
         return HeadStartAttempt(HeadStart(kept))
     except Exception as error:  # noqa: BLE001 - after any error, the router starts without it and logs why
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        why = error.strerror if isinstance(error, OSError) else None
-        return HeadStartAttempt(None, why or f"{type(error).__name__}: {error}")
+        listener = error.strerror if isinstance(error, OSError) else ""
+        return HeadStartAttempt(None, listener or f"{type(error).__name__}: {error}")

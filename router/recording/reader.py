@@ -83,9 +83,10 @@ class Recording:
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
-            hint = did_you_mean_file(str(path), path) or f"paths are relative to the working directory, {Path.cwd()}"
-            is_missing = isinstance(error, FileNotFoundError)
-            raise UsageError(f"{path}: {error.strerror}", hint if is_missing and not path.is_absolute() else "") from error
+            hint = did_you_mean_file(str(path), path) if isinstance(error, FileNotFoundError) else ""
+            if isinstance(error, FileNotFoundError) and not path.is_absolute():
+                hint = hint or f"paths are relative to the working directory, {Path.cwd()}"
+            raise UsageError(f"{path}: {error.strerror}", hint) from error
         self.size = os.fstat(self._file.fileno()).st_size  # the file may be removed meanwhile
         try:
             self._find_metadata()

@@ -239,7 +239,7 @@ def _refuse_other_type(kind: Type, node: ScalarNode) -> None:
         hint = f"write it without quotes: {node.text}"
         raise invalid(node.span, Code.WRONG_TYPE, f"the text '{node.text}' is not a {kind}", hint)
     if isinstance(kind, Bool) and not isinstance(node.value, bool):
-        hint = {0: "write false", 1: "write true"}.get(node.value, "write true or false")
+        hint = {"0": "write false", "1": "write true"}.get(node.text, "write true or false")
         raise invalid(node.span, Code.WRONG_TYPE, f"'{node.text}' is not a bool", hint)
 
 

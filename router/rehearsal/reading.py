@@ -64,7 +64,9 @@ def find_test_files(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
             try:
-                found = sorted(file for file in path.iterdir() if file.name.endswith(TEST_ENDINGS) and file.name[0] != ".")
+                found = sorted(
+                    file for file in path.iterdir() if file.name.endswith(TEST_ENDINGS) and file.name[0] != "."
+                )
             except OSError as error:
                 raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
             files.update(dict.fromkeys(found))

@@ -112,8 +112,6 @@ def for_common_mistake(name: str, known: Iterable[str]) -> str:
     return next((hint for key, names, hint in _COMMON_MISTAKES if key in known and name in names), "")
 
 
-
-
 def behind(name: str, entry: Entry, before: tuple[str, Entry] | None) -> str:
     """Return a hint for a key that continues the text before it, or that may belong to the fields above it."""
     if before is None:
@@ -247,8 +245,11 @@ def for_value(error: SchemaError) -> str:
         return f"write it without quotes: {value}"
     if error.path == ("version",):
         return f"write `version: {error.limit}`: this router knows no other"
-    if error.keyword != "enum":
-        return ""
+    return _for_word(error, value) if error.keyword == "enum" else ""
+
+
+def _for_word(error: SchemaError, value: str) -> str:
+    """Return a hint for a text that is none of the words that a key takes."""
     if error.path[-1] in ("qos", "profile") and (key := _QOS_WORDS.get(value)):
         return f"write `qos: {{{key}}}`"
     if near := nearest(value, error.limit):
@@ -392,17 +393,10 @@ def _decimal(siblings: MappingNode, name: str) -> str:
 
 def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     """Return a hint with the value in the form that its key takes."""
-    if isinstance(value, str) and _is_of(error.limit, resolve(value)):
-        return f"write it without quotes: {value}"
-    if isinstance(value, str) and (written := as_variable(value)):
-        return written
+    if isinstance(value, str) and (hint := _for_text(error, name, value)):
+        return hint
     if isinstance(value, bool):
         return _for_truth(error.path, value)
-    if name == "send" and isinstance(value, str):
-        case = _in_flow(value)
-        return f"write `send: {{{case}: {{FIELD: VALUE}}}}`, or `send: {{{case}: {{}}}}` for defaults"
-    if isinstance(value, dict) and isinstance(error.path[-1], int) and any(key in error.path for key in NAME_FIELDS):
-        return "write each element as one expression, for a value or a whole message: [a, b]"
     if hint := _for_collection(error, value) or _with_unit(error, value):
         return hint
     if _is_at(error.path[-3:], ("deadman", "send", "*")):
@@ -418,11 +412,25 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     if error.limit == "array":
         is_address = "zenoh" in error.path and re.fullmatch(r"[\w.-]+:\d+", written)
         return f"write `{name}: [{'tcp/' if is_address else ''}{written}]`"
-    if error.limit == "string" and isinstance(value, int) and name in ADDRESSES:
+    return _as_text(error, name, value, written) if error.limit == "string" else ""
+
+
+def _for_text(error: SchemaError, name: str, value: str) -> str:
+    """Return a hint for a text where a number, a truth value or a mapping is needed."""
+    if _is_of(error.limit, resolve(value)):
+        return f"write it without quotes: {value}"
+    if name == "send":
+        case = _in_flow(value)
+        return f"write `send: {{{case}: {{FIELD: VALUE}}}}`, or `send: {{{case}: {{}}}}` for defaults"
+    return as_variable(value)
+
+
+def _as_text(error: SchemaError, name: str, value: object, written: str) -> str:
+    """Return a hint for a value where text is needed."""
+    if isinstance(value, int) and name in ADDRESSES:
         return f"write `{name}: IP:{written}`"
-    if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
-        return f'quote it: "{written}"'
-    return ""
+    takes_any = not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list)
+    return f'quote it: "{written}"' if takes_any else ""
 
 
 def _for_truth(path: Path, value: bool) -> str:
@@ -437,13 +445,14 @@ def _for_truth(path: Path, value: bool) -> str:
 
 def _case_or_field(name: str, value: object) -> str:
     """Return a hint for a value under `send` of a deadman that has a payload case or a field, but not both."""
-    if (written := _in_flow(value)) is None:
+    if (scalars := _in_flow(value)) is None:
         return ""
-    written = f"[{written}]" if isinstance(value, list) else written
+    written = f"[{scalars}]" if isinstance(value, list) else scalars
     case, dot, field = name.partition(".")
     if dot:
         return f"write `{case}: {{{field}: {written}}}`"
-    return f"if '{name}' is a payload case, write `{name}: {{FIELD: {written}}}`; if it is a field, `CASE: {{{name}: {written}}}`"
+    as_case, as_field = f"`{name}: {{FIELD: {written}}}`", f"`CASE: {{{name}: {written}}}`"
+    return f"if '{name}' is a payload case, write {as_case}; if it is a field, {as_field}"
 
 
 def _is_of(kinds: str | list[str], value: object) -> bool:
@@ -453,6 +462,8 @@ def _is_of(kinds: str | list[str], value: object) -> bool:
 
 
 def _for_collection(error: SchemaError, value: object) -> str:
+    if isinstance(value, dict) and isinstance(error.path[-1], int) and {*NAME_FIELDS} & {*error.path}:
+        return "write each element as one expression, for a value or a whole message: [a, b]"
     if isinstance(value, dict) and error.limit == "array":
         return f"start each item with '-', or write `{error.path[-1]}: [{{...}}]`"
     if not isinstance(value, list):

@@ -158,7 +158,9 @@ def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnos
     return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
 
 
-_EXCLAMATION = re.compile(r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?= *(?:[,}\]<>=]|$|(?:and|or|if)\b)))))")
+_EXCLAMATION = re.compile(
+    r"(?:^|[:,\[{]) *(?:- +)*(?P<all>! ?(?P<what>\(|[A-Za-z_][\w.]*(?:\(|(?= *(?:[,}\]<>=]|$|(?:and|or|if)\b)))))"
+)
 _NO_EXCLAMATION = "a value cannot start with '!'"
 
 

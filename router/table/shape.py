@@ -6,9 +6,9 @@ key is reported and then read as the key that was meant, so that this key is not
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 
 from router.errors import Code, Diagnostic, SourceSpan, nearest
 from router.table import hints
@@ -52,7 +52,8 @@ _HINT_FOR_WHOLE = "write 'envelope', 'listen' and 'routes'; or, for a table with
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """Return the tree with misspelt keys corrected and everything that has a finding marked broken."""
     found = schema_errors(root, SCHEMA)
-    if filled := {error.path: functools.partial(_as_taken, kinds=error.limit) for error in found if _is_filled(error, root)}:
+    filled = {error.path: partial(_as_taken, kinds=error.limit) for error in found if _is_filled(error, root)}
+    if filled:
         root = mapping(rewritten(root, filled))
         found = schema_errors(root, SCHEMA)
     if not found:
@@ -66,7 +67,7 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
         for error in unknown:
             known = list(error.schema["properties"])
             findings.extend(unknown_keys(tree, error.path, known, subject(error.path), empty))
-            repairs[error.path] = functools.partial(_with_known_keys, path=error.path, known=known)
+            repairs[error.path] = partial(_with_known_keys, path=error.path, known=known)
         tree = rewritten(tree, repairs)
         found = schema_errors(tree, SCHEMA)
     rests = {error.path for error in found if _is_rest(tree, error.path)}
@@ -124,7 +125,7 @@ def _with_deep_keys(tree: Node, wrong: Container[Path], findings: list[Diagnosti
             findings.append(Diagnostic(entry.key.span, Code.UNKNOWN_KEY, message, hint))
             entries[before] = replace(entries[before], value=_as_broken(entries[before].value))
         if len(entries) < len(node.entries):
-            tree = rewritten(tree, {(part,): functools.partial(_with_entries, entries=entries)})
+            tree = rewritten(tree, {(part,): partial(_with_entries, entries=entries)})
     return tree
 
 

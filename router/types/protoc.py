@@ -159,7 +159,6 @@ def _import_hint(name: str, importer: str, files: Collection[str], root: Path) -
     return f"copy it into {shown_path(root)}, the folder that imports are relative to"
 
 
-
 def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     """Return a hint with the files that declare a type that is not defined where it is used."""
     found = declaring(name, files)

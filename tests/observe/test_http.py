@@ -188,7 +188,7 @@ def test_what_is_not_kept_cannot_be_saved(running: FakeRunning) -> None:
     with closing(served(running)) as server:
         answer = ask(server, "/record/save", "POST")
     assert answer.status == 404
-    assert "record: {last: 60s}" in answer.json["text"]
+    assert "`last: 60s`" in answer.json["text"]
 
 
 @pytest.mark.parametrize(("method", "path"), [("POST", "/-/reload"), ("POST", "/record/save"), ("GET", "/tap")])

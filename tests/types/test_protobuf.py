@@ -101,8 +101,8 @@ def test_envelope_in_a_package_is_found_by_short_name(write: Write) -> None:
             "Envelope", "paylod",
             "table.yaml:4:10: error[bad-value]: Envelope has no oneof 'paylod'; did you mean 'payload'?",
         ),
-        ("Imu", "payload", "table.yaml:4:10: error[bad-value]: Imu has no oneof 'payload'; "
-         "Envelope has it: write `message: Envelope` if that is the envelope"),
+        ("Imu", "payload", ("table.yaml:4:10: error[bad-value]: Imu has no oneof 'payload'; "
+         "Envelope has it: write `message: Envelope` if that is the envelope")),
     ],
 )  # fmt: skip
 def test_wrong_name_in_the_table_is_a_finding_there(write: Write, message: str, oneof: str, finding: str) -> None:
@@ -128,8 +128,10 @@ STRAY = {
     "does not compile": ("message A { int32 x = 1 }", 'b.proto:2:25: warning[unused-proto]: {}: Expected ";"'),
     "imports what is not there": (
         'import "nowhere";',
-        "b.proto:2:1: warning[unused-proto]: {}: there is no file 'nowhere' to import; "
-        "copy it into ., the folder that imports are relative to",
+        (
+            "b.proto:2:1: warning[unused-proto]: {}: there is no file 'nowhere' to import; "
+            "copy it into ., the folder that imports are relative to"
+        ),
     ),
     "has a message of the same name": (
         "message Imu {}",
