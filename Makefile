@@ -48,8 +48,9 @@ test-all: tools  ## run all tests, including slow ones, and the carrier's again 
 demo: setup  ## simulated rover, router and real ROS nodes; a lost link brakes the rover
 	@$(ENV) .venv/bin/python -m demo
 
-bench: tools  ## compare the router with the C++ node, about an hour; ARGS="--only own_table --repeat 3" for less
-	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
+bench: tools  ## measure all figures and write them into README and docs, about two hours on an idle computer, as root
+	@$(ENV) .venv/bin/python -m benchmarks.versus
+	@$(ENV) .venv/bin/python -m benchmarks.pressure --seconds 5 --repeat 3
 	@.venv/bin/python docs/generate.py
 
 pictures: tools  ## take the pictures of the README and the documentation from the running program, with Chromium

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
+from benchmarks.versus import claims
 from benchmarks.versus.report import page as figures
 from docs import reference_pages
 from router.assets import asset
@@ -35,8 +36,11 @@ from tests.bad_tables.corpus import HERE as CORPUS
 from tests.bad_tables.corpus import BadTable, good, sections
 
 HERE = Path(__file__).parent
+README = "../README.md"
 RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
+_FIGURES = """\
+[How they were measured](performance.md). Each scenario is described as it was at its commit."""
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _KEYS = """\
 [The route table](table.md) explains how they work together. A dot separates a key from the keys inside it.
@@ -184,7 +188,17 @@ def first_finding(mistake: BadTable) -> str:
 def figures_page() -> str:
     """The results of `make bench`."""
     found = json.loads(RESULTS.read_text(encoding="utf-8"))
-    return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{figures(found)}"
+    return f"# Figures\n\n{_MADE}\n{_FIGURES}\n\n{figures(found)}"
+
+
+def readme() -> str:
+    """The README, with the table of figures made from the results of `make bench`."""
+    text = (HERE / README).read_text(encoding="utf-8")
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    begin, end = "<!-- Made by docs/generate.py: -->\n", "<!-- End. -->\n"
+    before, _, rest = text.partition(begin)
+    after = rest.partition(end)[2]
+    return f"{before}{begin}{claims.table(found)}{end}{after}"
 
 
 PAGES = {
@@ -195,6 +209,7 @@ PAGES = {
     "reference/metrics.md": metrics_page,
     "reference/findings.md": findings_page,
     "design/figures.md": figures_page,
+    README: readme,
 }
 
 

@@ -1,6 +1,6 @@
 """How late a router forwards and brakes while something presses on it, and what a datagram costs it then.
 
-    python -m benchmarks.pressure
+    python -m benchmarks.pressure --seconds 5 --repeat 3        # as `make bench` does; writes the file of results
     python -m benchmarks.pressure --only http,images --rate 20000 --repeat 3 --output pressure.json
     python -m benchmarks.pressure --command "env -C DIR PYTHONPATH=DIR .venv/bin/python -m router run TABLE"
     python -m benchmarks.pressure --only busy --vs "OUT/cpp_peer --listen LISTEN --to FIRST --to SECOND"
@@ -9,9 +9,10 @@ Each round is a fresh process on a core of its own, with the table of a rover on
 cases go from one board to one destination and one topic each, while commands come by UDP and from ROS, in bursts with
 silences between in which their deadmen have to brake. Latency is from just before a datagram is sent to the kernel's
 time stamp on arrival. Brake times are from the last command that was sent to the first brake that the board got, less
-the deadman's timeout. The first subject and the other (--vs) take turns. Where a pressure did not press, or the
-receiver lost something, the figures are INVALID. Takes Linux, two cores, a C compiler and rclpy; root for realtime
-priorities of sender and receiver, and for `second-router`.
+the deadman's timeout. Without --command, this router is measured twice, without and with the right to a real-time
+priority, and the figures are merged into the file of results. Subjects take turns. Where a pressure did not press, or
+the receiver lost something, the figures are INVALID. Takes Linux, two cores, a C compiler and rclpy; root for real-time
+priorities and for `second-router`.
 """
 
 from __future__ import annotations
@@ -32,9 +33,12 @@ from benchmarks.pressure import figures
 from benchmarks.pressure.figures import Round
 from benchmarks.pressure.pressures import PRESSURES, Pressure
 from benchmarks.pressure.trial import Command, Settings, Trial, build
+from benchmarks.versus import results
+from benchmarks.versus.figures import judge
 from benchmarks.versus.processes import cores
 
 OURS = f"{shlex.quote(sys.executable)} -m router run TABLE"
+REALTIME = "router_realtime"
 
 Rounds = dict[str, dict[str, list[Round]]]
 """Subject -> pressure -> its rounds."""
@@ -57,8 +61,7 @@ def measured(subjects: Sequence[Command], pressures: Sequence[Pressure], repeat:
 
 
 def rows(found: Rounds) -> dict[str, dict[str, figures.Row]]:
-    first, *others = found
-    other = found[others[0]] if others else {}
+    first, other = next(iter(found)), found.get("other", {})
     return {
         subject: {
             pressure: figures.row(
@@ -83,8 +86,12 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
         prog="python -m benchmarks.pressure", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--command", default=OURS, help="starts the router; TABLE is the path of its table (default: this router)")
-    add("--vs", help="starts another one, or a program that takes LISTEN and FIRST, as addresses, instead of TABLE")
+    add("--command", help="starts another router; TABLE is the path of its table. Writes no results")
+    add(
+        "--vs",
+        help="starts one to compare with, or a program that takes LISTEN and FIRST, as addresses, instead of TABLE. "
+        "Writes no results",
+    )
     add("--only", type=chosen, default=list(PRESSURES), metavar="NAME[,NAME]", help=f"of {', '.join(known)}")
     add("--rate", type=float, default=1000, help="datagrams per second (default: %(default)g)")
     add("--seconds", type=float, default=10, help="length of one run (default: %(default)g)")
@@ -108,6 +115,35 @@ def report(args: argparse.Namespace, found: Rounds) -> dict[str, Any]:
     return {"machine": machine, "settings": settings, "summary": summary, "rounds": rounds}
 
 
+def subjects(args: argparse.Namespace, folder: Path) -> list[Command]:
+    """Named as in the file of results, if they go there."""
+    if is_for_results(args):
+        return [
+            Command("router", folder, command=OURS),
+            Command(REALTIME, folder, command=OURS, realtime=True),
+        ]
+    commands = {"router": args.command or OURS} | ({"other": args.vs} if args.vs else {})
+    return [Command(name, folder, command=command, realtime=True) for name, command in commands.items()]
+
+
+def is_for_results(args: argparse.Namespace) -> bool:
+    return not args.command and not args.vs
+
+
+def store(args: argparse.Namespace, found: Rounds) -> None:
+    """Merges each pressure into the file of results, as a scenario."""
+    known = results.load(results.DEFAULT)
+    for pressure in args.only:
+        rounds = {
+            subject: [{**one.metrics, "invalid": len(one.invalid)} for one in each[pressure.name]]
+            for subject, each in found.items()
+        }
+        title = f"Forwarding and brakes at {args.rate:,.0f} per second, beside {pressure.title}"
+        judged = judge(figures.aims(pressure.name, [*rounds]), rounds)
+        results.merge(known, f"pressure_{pressure.name}", results.entry(title, rounds, judged, args.seconds))
+    results.store(results.DEFAULT, known)
+
+
 def main() -> None:
     args = arguments()
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
@@ -119,11 +155,11 @@ def main() -> None:
         os.environ["ROS_LOG_DIR"] = name
         build(folder)
         settings = Settings(args.rate, args.seconds, args.seed, folder, folder)
-        commands = {"router": args.command} | ({"other": args.vs} if args.vs else {})
-        subjects = [Command(name, folder, command=command) for name, command in commands.items()]
-        found = measured(subjects, args.only, args.repeat, settings)
+        found = measured(subjects(args, folder), args.only, args.repeat, settings)
     for subject, each in rows(found).items():
         print(figures.text(subject, each), end="\n\n")
+    if is_for_results(args):
+        store(args, found)
     if args.output:
         args.output.write_text(json.dumps(report(args, found), indent=1))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from benchmarks.versus.figures import Spread, spread
+from benchmarks.versus.figures import Aim, Spread, spread
 from benchmarks.versus.trial import Metrics
 
 ALONE = "alone"
@@ -54,6 +54,13 @@ class Row(NamedTuple):
     versus: float | None
     missed: Sequence[str]
     invalid: Sequence[str]
+
+
+def aims(pressure: str, subjects: Sequence[str]) -> list[Aim]:
+    """What the file of results says of each subject under a pressure."""
+    most = MOST_BRAKE_MS.get(pressure, MOST_BRAKE_MS_ELSE)
+    limits = {P99: MOST_US, **dict.fromkeys(BRAKES, most), "brakes_missing": 0.0}
+    return [Aim(metric, of=subject, at_most=limit) for subject in subjects for metric, limit in limits.items()]
 
 
 def quantiles(values: Sequence[float], names: Mapping[str, float]) -> Metrics:

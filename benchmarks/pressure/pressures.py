@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.pressure.tables import SHARED_MEMORY, Place, table
+from benchmarks.versus import helpers
 from benchmarks.versus.helpers import Helper
-from benchmarks.versus.processes import cores, read
+from benchmarks.versus.processes import read
 from benchmarks.versus.subject import Subject
 
 CLIENTS = 100
 FEWEST_CLIENTS = 4
 """Of those, connected at once: a router may refuse more of one host, and they try again all the time."""
 
-BUSY = 4
 BUSY_CORES = 0.5
 """What the busy processes together get at least; nearly both cores where nothing else runs."""
 
@@ -195,17 +194,7 @@ def recording(pressed: Pressed) -> Iterator[Judge]:
 
 @contextmanager
 def busy(_: Pressed) -> Iterator[Judge]:
-    both = {cores().subject, cores().helpers}
-    with ExitStack() as opened:
-        children = []
-        for _number in range(BUSY):
-            child = subprocess.Popen(
-                [sys.executable, "-c", f"import os; os.sched_setaffinity(0, {both})\nwhile True: pass"]
-            )
-            opened.callback(child.wait)
-            opened.callback(child.kill)
-            children.append(child)
-        time.sleep(SETTLE_SECONDS)
+    with helpers.busy() as children:
         before = sum(_cpu_seconds(child.pid) for child in children)
 
         def judge(seconds: float) -> Proof:
@@ -221,23 +210,24 @@ def _cpu_seconds(pid: int) -> float:
 
 @dataclass(frozen=True)
 class Pressure:
-    """`for_routers`: whether it needs what only a router has, such as a table. `before`: datagrams sent before."""
+    """`title`: what it is. `for_routers`: whether it needs what only a router has. `before`: datagrams sent before."""
 
     name: str
+    title: str
     press: Callable[[Pressed], AbstractContextManager[Judge]]
     for_routers: bool = False
     before: int = 0
 
 
 PRESSURES = (
-    Pressure("alone", alone),
-    Pressure("subscriber", subscriber),
-    Pressure("second-router", second_router),
-    Pressure("http", http, for_routers=True),
-    Pressure("images", images, for_routers=True),
-    Pressure("reloads", reloads, for_routers=True),
-    Pressure("recording", recording, for_routers=True, before=PREFILLED),
-    Pressure("busy", busy),
+    Pressure("alone", "nothing else", alone),
+    Pressure("subscriber", "a subscriber of all topics", subscriber),
+    Pressure("second-router", "a subscriber with a /dev/shm of its own, as in a container", second_router),
+    Pressure("http", f"{CLIENTS} HTTP clients that send requests and do not read", http, for_routers=True),
+    Pressure("images", "images of 2 MB through a gateway", images, for_routers=True),
+    Pressure("reloads", f"another table every {RELOAD_SECONDS} s", reloads, for_routers=True),
+    Pressure("recording", "a saved minute every second", recording, for_routers=True, before=PREFILLED),
+    Pressure("busy", f"{helpers.BUSY} busy processes on both cores", busy),
 )
 
 

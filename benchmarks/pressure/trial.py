@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from benchmarks.pressure import tables, traffic
 from benchmarks.pressure.figures import Round, quantiles
 from benchmarks.pressure.pressures import Pressed, Pressure, metrics, total
 from benchmarks.pressure.tables import Place
-from benchmarks.versus.contenders import PAYLOADS, Ports, Router, datagrams
+from benchmarks.versus.contenders import ORDINARY, PAYLOADS, Ports, Router, datagrams
 from benchmarks.versus.helpers import Helper
 from benchmarks.versus.subject import Meter, Subject
 from benchmarks.versus.trial import Metrics
@@ -62,7 +62,8 @@ class Command(Router):
             "FIRST": f"{tables.BASESTATION}:{ports.first}",
             "SECOND": f"127.0.0.1:{ports.second}",
         }
-        return [known.get(word, word) for word in shlex.split(self.command)]
+        start = () if self.realtime else ORDINARY
+        return [*start, *(known.get(word, word) for word in shlex.split(self.command))]
 
     def environment(self, ports: Ports) -> dict[str, str]:
         """A native program finds ROS's libraries by what the wheels set in ours; Python starts as from a shell."""
@@ -94,7 +95,7 @@ class Trial:
         self._settings = settings
         self._pressure = pressure
         self._place = place = Place.free(settings.folder / self._name)
-        self._command = Command(subject.name, place.table, command=subject.command)
+        self._command = replace(subject, table=place.table)
         self._noise = random.Random(f"{settings.seed} {number}")
         self._first = 0
         place.table.write_text(tables.table(place, pressure.name))
@@ -117,6 +118,7 @@ class Trial:
             self._sent(self._telemetry(FLOOD_RATE, self._pressure.before / FLOOD_RATE))
             commander = opened.enter_context(self._commander(ros)) if ros else None
             before = metrics(place.metrics) if is_router else {}
+            conditions = subject.conditions()
             with self._pressure.press(Pressed(subject, place)) as judge:
                 meter, began = Meter(subject), time.monotonic()
                 if commander:
@@ -132,7 +134,7 @@ class Trial:
             after = metrics(place.metrics) if is_router else {}
             ended = receiver.stop()
         arrivals = np.fromfile(log, dtype=traffic.ARRIVAL)
-        result: Metrics = {"cpu_us": round(meter.cpu_ns / 1e3 / max(1, told["sent"] - meter.drops), 2)}
+        result: Metrics = conditions | {"cpu_us": round(meter.cpu_ns / 1e3 / max(1, told["sent"] - meter.drops), 2)}
         result |= {"noise": round(meter.noise, 3), "generator_slips": told["slips"]}
         result |= self._forwarded(plan, sent, first, arrivals)
         if is_router:

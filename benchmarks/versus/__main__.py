@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from typing import Any
 
 from benchmarks.versus import report, results, sized, unrecorded
 from benchmarks.versus.building import build
+from benchmarks.versus.contenders import REALTIME
 from benchmarks.versus.figures import judge
 from benchmarks.versus.processes import cores
 from benchmarks.versus.scenarios import SCENARIOS, Scenario
@@ -27,7 +29,7 @@ def measured(scenario: Scenario, pace: Pace, repeat: int, folder: Path) -> dict[
         for contender in scenario.contenders:
             print(f"{scenario.name}: round {turn + 1} of {repeat}, {contender.name}", file=sys.stderr)
             rounds[contender.name].append(scenario.measure(Trial(contender, pace, folder)))
-    return results.entry(scenario, rounds, judge(scenario.aims, rounds), pace.seconds)
+    return results.entry(scenario.title, rounds, judge(scenario.aims, rounds), pace.seconds)
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
@@ -49,11 +51,19 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
+def _require_realtime() -> None:
+    """Ends this program if it may not start others at a real-time priority."""
+    if subprocess.run([*REALTIME, "true"], stderr=subprocess.DEVNULL, check=False).returncode:
+        sys.exit("these scenarios start programs at a real-time priority: run as root, or others with --only")
+
+
 def main() -> None:
     args = arguments()
     pace = QUICK if args.quick else replace(Pace(), seconds=args.seconds)
     output = args.output or (None if args.quick else results.DEFAULT)
     known = results.load(output) if output else results.empty()
+    if any(contender.realtime for scenario in args.only for contender in scenario.contenders):
+        _require_realtime()
     build()
     for routes in (sized.SMALL, sized.LARGE, sized.LARGEST):
         sized.write(routes, sized.folder(routes))

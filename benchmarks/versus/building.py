@@ -19,6 +19,7 @@ _MADE = PROGRAMS / "made"
 _NEEDED = {
     "gcc": "gcc",
     "g++": "g++",
+    "ss": "iproute2",
     "/usr/bin/protoc": "protobuf-compiler",
     "/usr/include/google/protobuf/message.h": "libprotobuf-dev",
 }

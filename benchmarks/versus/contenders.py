@@ -14,6 +14,12 @@ TABLES = Path(__file__).parent.parent / "tables"
 PAYLOADS = PEER / "payloads.txt"
 LISTENERS = 8
 
+_WITHOUT_CAPABILITY = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
+ORDINARY = (*(_WITHOUT_CAPABILITY if os.geteuid() == 0 else ()), "prlimit", "--rtprio=0:0")
+"""Starts a program without the right to a real-time priority: as an ordinary user."""
+REALTIME = ("chrt", "--fifo", "1")
+"""Starts a program with the real-time priority that the service's router gives to its own threads."""
+
 
 def datagrams(payloads: Path) -> list[tuple[str, bytes]]:
     """What a file of datagrams holds, each with its payload case, in the order in which they are sent in turns."""
@@ -54,7 +60,8 @@ class Ports:
 class Router:
     """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any. `payloads`: which.
 
-    `board`: host and port of a board to which a deadman sends at the start.
+    `board`: host and port of a board to which a deadman sends at the start. `realtime`: whether it may take a real-time
+    priority, as the service may.
     """
 
     name: str
@@ -63,9 +70,11 @@ class Router:
     listens: bool = True
     payloads: Path = PAYLOADS
     board: tuple[str, int] | None = None
+    realtime: bool = False
 
     def words(self, _: Ports) -> list[object]:
-        return [sys.executable, "-m", "router", "run", self.table, "--log-level", "error"]
+        start = () if self.realtime else ORDINARY
+        return [*start, sys.executable, "-m", "router", "run", self.table, "--log-level", "error"]
 
     def environment(self, ports: Ports) -> dict[str, str]:
         """Without what the wheels set in ours, so that it starts as from a shell."""
@@ -75,7 +84,7 @@ class Router:
 
 @dataclass(frozen=True)
 class Native:
-    """One of our C and C++ programs, with further `options`."""
+    """One of our C and C++ programs, with further `options`. `realtime`: it runs at the router's real-time priority."""
 
     name: str
     program: str
@@ -84,10 +93,12 @@ class Native:
     listens: bool = True
     payloads: Path = PAYLOADS
     board: None = None
+    realtime: bool = False
 
     def words(self, ports: Ports) -> list[object]:
+        start = REALTIME if self.realtime else ()
         to = [word for port in (ports.first, ports.second)[: self.copies] for word in ("--to", f"127.0.0.1:{port}")]
-        return [PROGRAMS / self.program, "--listen", f"127.0.0.1:{ports.listen[0]}", *to, *self.options]
+        return [*start, PROGRAMS / self.program, "--listen", f"127.0.0.1:{ports.listen[0]}", *to, *self.options]
 
     def environment(self, _: Ports) -> dict[str, str]:
         """With what the wheels set in ours: it finds ROS's libraries by it."""

@@ -12,9 +12,9 @@ from benchmarks.versus.trial import Metrics, Trial
 
 def inbound_cost(trial: Trial, rates: Sequence[float], topics: Sequence[Topic]) -> Metrics:
     """`cpu_us@RATE`: CPU microseconds per datagram, of all threads; one process subscribes to the topics."""
-    metrics: Metrics = {}
     with trial.started() as subject, subscribed(topics) as listening:
         warm_up(subject, trial.pace)
+        metrics = subject.conditions()
         for rate in trial.pace.rates(rates):
             result = run(subject, Traffic(rate, trial.pace.seconds), trial.pace, listening)
             metrics[f"cpu_us@{rate:g}"] = result.cpu_us

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from benchmarks.versus.trial import Metrics
 
-COUNTED = ("lost", "ros_lost", "too_slow", "not_overloaded")
+COUNTED = ("lost", "ros_lost", "too_slow", "not_overloaded", "invalid")
 """Where one of these is above 0, what was measured under the same condition does not count."""
 
 
@@ -21,10 +21,11 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Aim:
-    """A figure to be shown: a metric of the first contender, or its ratio to that of another. It may have a limit."""
+    """A figure to be shown: a metric of a contender, or its ratio to that of another. It may have a limit."""
 
     metric: str
     against: str | None = None
+    of: str = "router"
     at_most: float | None = None
     at_least: float | None = None
 
@@ -80,11 +81,13 @@ class Judged(NamedTuple):
 
 
 def judge(aims: Iterable[Aim], rounds: Mapping[str, Sequence[Metrics]]) -> list[Judged]:
-    """`rounds` are those of each contender, of which the first is judged. What was not measured is left out."""
-    first = next(iter(rounds.values()))
+    """`rounds` are those of each contender. What was not measured is left out."""
     judged = []
     for aim in aims:
-        other = rounds[aim.against] if aim.against else []
+        first = rounds.get(aim.of, [])
+        other = rounds.get(aim.against, []) if aim.against else []
+        if not first or bool(other) != bool(aim.against):
+            continue
         value = ratio(aim.metric, first, other) if aim.against else spreads(first).get(aim.metric)
         if value is not None:
             is_sound = counts(aim.metric, [*first, *other])

@@ -10,8 +10,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
@@ -25,6 +25,9 @@ POLL_US = 1000
 
 KEEPS_UP = 0.97
 """Of the rate that is asked of a generator, what it has to reach."""
+
+BUSY = 4
+SETTLE_SECONDS = 1.0
 
 BEGINNING_S = 30.0
 """How long a helper may take to begin on a busy machine."""
@@ -89,6 +92,21 @@ class Helper(AbstractContextManager["Helper"]):
     def stop(self) -> dict[str, Any]:
         """Ends it; what it has to say at the end."""
         return self.ask(signal.SIGTERM)
+
+
+@contextmanager
+def busy() -> Iterator[Sequence[subprocess.Popen[bytes]]]:
+    """Processes that use both cores as much as they get."""
+    both = {cores().subject, cores().helpers}
+    words = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, {both})\nwhile True: pass"]
+    with ExitStack() as opened:
+        children = []
+        for _ in range(BUSY):
+            children.append(child := subprocess.Popen(words))
+            opened.callback(child.wait)
+            opened.callback(child.kill)
+        time.sleep(SETTLE_SECONDS)
+        yield children
 
 
 def load(

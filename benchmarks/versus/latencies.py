@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from benchmarks.versus.helpers import GPS
+from collections.abc import Mapping
+
+from benchmarks.versus.helpers import GPS, busy
 from benchmarks.versus.runs import Traffic, run, warm_up
 from benchmarks.versus.subscriber import subscribed
 from benchmarks.versus.trial import Metrics, Trial
@@ -15,16 +17,36 @@ def latency(trial: Trial, rate: float, seconds: float) -> Metrics:
 
     `udp_subscribed_*` is the first again, while that subscriber listens.
     """
-    metrics: Metrics = {}
     traffic = Traffic(rate, min(seconds, trial.pace.longest), stamped=True)
     with trial.started() as subject:
         warm_up(subject, trial.pace)
+        metrics = subject.conditions()
         alone = run(subject, traffic, trial.pace)
         with subscribed([GPS]) as listening:
             heard = run(subject, traffic, trial.pace, listening)
     for result in (alone, heard):
         result.add_to(metrics, "")
     found = {"udp": alone.latency_us, "udp_subscribed": heard.latency_us, "ros": heard.ros_latency_us}
-    for name, latencies in found.items():
-        metrics |= {f"{name}_{quantile}_us": latencies[quantile] for quantile in QUANTILES if latencies}
-    return metrics
+    return metrics | _named(found)
+
+
+def latency_beside_busy(trial: Trial, rate: float, seconds: float) -> Metrics:
+    """`udp_*` while other processes use both cores; generator and sink have a real-time priority above all others."""
+    traffic = Traffic(rate, min(seconds, trial.pace.longest), stamped=True, first=True)
+    with trial.started() as subject:
+        warm_up(subject, trial.pace)
+        metrics = subject.conditions()
+        with busy():
+            result = run(subject, traffic, trial.pace)
+    result.add_to(metrics, "")
+    return metrics | _named({"udp": result.latency_us})
+
+
+def _named(found: Mapping[str, Mapping[str, float] | None]) -> Metrics:
+    """`NAME_QUANTILE_us` of those that were measured."""
+    return {
+        f"{name}_{quantile}_us": latencies[quantile]
+        for name, latencies in found.items()
+        if latencies
+        for quantile in QUANTILES
+    }

@@ -91,7 +91,7 @@ def highest_rate(trial: Trial, topics: Sequence[Topic]) -> Metrics:
     with trial.started() as subject, subscribed(topics) as listening:
         warm_up(subject, trial.pace)
         search = Search(subject, trial.pace, listening)
-        return {
+        return subject.conditions() | {
             "max_rate": round(search.highest()),
             "generator_gave_up": search.generator_gave_up,
             "only_ros_lost": search.only_ros_lost,

@@ -12,6 +12,8 @@ from typing import IO, NamedTuple
 
 TICKS = os.sysconf("SC_CLK_TCK")
 
+FIRST = -100
+
 
 class Cores(NamedTuple):
     """The process under test has one to itself; everything else shares the other."""
@@ -41,11 +43,13 @@ def spawn(
     """Starts a program on one core.
 
     A `priority` below 0 takes a privilege, without which the program runs as any other. None is the lowest there is:
-    it runs while nothing else wants to.
+    it runs while nothing else wants to. FIRST is a real-time priority, above that of every process under test.
     """
     prefix = ["taskset", "-c", core]
     if priority is None:
         prefix += ["chrt", "--idle", 0]
+    elif priority == FIRST:
+        prefix += ["chrt", "--fifo", 10]
     elif priority:
         prefix += ["nice", "-n", priority]
     return subprocess.Popen(

@@ -10,7 +10,7 @@ NOTES = {"noise": (0.05, "noisy"), "generator_gave_up": (0.0, "at least")}
 """What to say of a contender in whose rounds such a metric was above a limit: others took so much of a core; a faster
 generator might have found more."""
 
-HEADINGS = ("figure", "router", "other", "ratio", "range", "aim", "", "notes")
+HEADINGS = ("figure", "measured", "other", "measured / other", "range", "aim", "", "notes")
 
 WIDTH = 118
 
@@ -32,13 +32,12 @@ def notes(contenders: Mapping[str, Any]) -> str:
 def cells(entry: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """One row for each figure of a scenario, as HEADINGS say."""
     contenders = entry["contenders"]
-    first = next(iter(contenders.values()))
     for figure in entry["figures"]:
-        metric, against = figure["metric"], figure["against"]
-        shown = {name: contenders[name] for name in (next(iter(contenders)), against) if name}
+        metric, of, against = figure["metric"], figure["of"], figure["against"]
+        shown = {name: contenders[name] for name in (of, against) if name}
         yield (
             metric,
-            number(first[metric]["median"]),
+            f"{of} {number(contenders[of][metric]['median'])}",
             f"{against} {number(contenders[against][metric]['median'])}" if against else "",
             f"{figure['median']:.2f}" if against else "",
             f"{number(figure['min'])} to {number(figure['max'])}",
@@ -62,7 +61,7 @@ def page(results: Mapping[str, Any]) -> str:
     for name, entry in results["scenarios"].items():
         rounds = f"Medians of {entry['repeat']} fresh processes, {entry['date']}, commit {entry['commit']}."
         on = entry["machine"]
-        machine = f"{on['cpu']}, {on['cores']} cores, Linux {on['kernel']}, Python {on['python']}."
+        machine = f"{on['cpu']}, {on['cores']} cores, Linux {on['linux']}, Python {on['python']}."
         lines += ["", f"## `{name}`", "", fill(f"{entry['title']}. {rounds} {machine}", WIDTH), ""]
         lines += [f"| {' | '.join(row)} |" for row in (HEADINGS, ("---",) * len(HEADINGS), *cells(entry))]
     return "\n".join([*lines[1:], ""])

@@ -14,37 +14,41 @@ from typing import Any
 from benchmarks.versus.building import ROOT
 from benchmarks.versus.figures import Judged, spreads
 from benchmarks.versus.processes import read
-from benchmarks.versus.scenarios import SCENARIOS, Scenario
 from benchmarks.versus.trial import Metrics
 
 DEFAULT = ROOT / "benchmarks" / "results.json"
 
 
 def machine() -> dict[str, Any]:
-    """What figures depend on. Names neither the computer nor a path."""
+    """What figures depend on. Names neither the computer nor a path, nor the kernel's build: only its version."""
     lines = (line.partition(":") for line in read("/proc/cpuinfo").splitlines())
     model = next((value.strip() for key, _, value in lines if key.strip() == "model name"), platform.machine())
     return {
         "cpu": model,
         "cores": os.cpu_count(),
-        "kernel": platform.release(),
+        "linux": ".".join(platform.release().split(".")[:2]),
         "python": platform.python_version(),
     }
 
 
 def commit() -> str:
-    """Of this checkout, `+` if it has changes; empty where it is none."""
-    words = ["git", "describe", "--always", "--dirty=+"]
-    described = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    return described.stdout.strip()
+    """Of this checkout, `+` if anything but results has changed; empty where it is none."""
+
+    def git(*words: str) -> str:
+        command = ["git", *words]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+
+    written = (f":!{DEFAULT.relative_to(ROOT)}", ":!docs/design/figures.md", ":!README.md")
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", *written)
+    return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
 
 
 def entry(
-    scenario: Scenario, rounds: Mapping[str, Sequence[Metrics]], judged: Sequence[Judged], seconds: float
+    title: str, rounds: Mapping[str, Sequence[Metrics]], judged: Sequence[Judged], seconds: float
 ) -> dict[str, Any]:
     """What the file says of one scenario."""
     return {
-        "title": scenario.title,
+        "title": title,
         "machine": machine(),
         "date": datetime.now(timezone.utc).date().isoformat(),
         "commit": commit(),
@@ -57,6 +61,7 @@ def entry(
         "figures": [
             {
                 "metric": aim.metric,
+                "of": aim.of,
                 "against": aim.against,
                 **value._asdict(),
                 "aim": aim.text(),
@@ -78,9 +83,8 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def merge(results: dict[str, Any], name: str, entry: Mapping[str, Any]) -> None:
-    """Puts a scenario in the place of what was there of it; the others stay, in the order of their definition."""
-    found = {**results["scenarios"], name: entry}
-    results["scenarios"] = {scenario.name: found[scenario.name] for scenario in SCENARIOS if scenario.name in found}
+    """Puts a scenario in the place of what was there of it; the others stay."""
+    results["scenarios"][name] = entry
 
 
 def store(path: Path, results: Mapping[str, Any]) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from benchmarks.versus.contenders import payload_cases
 from benchmarks.versus.helpers import KEEPS_UP, STAMPED_CASE, load, publisher, sink
+from benchmarks.versus.processes import FIRST
 from benchmarks.versus.subject import Meter, Subject
 from benchmarks.versus.subscriber import Subscriber
 from benchmarks.versus.trial import Metrics, Pace
@@ -55,17 +56,20 @@ class Run:
 class Traffic:
     """Datagrams to the subject, of those meant for it.
 
-    `stamped`: only those that can carry the time of sending, and sinks wake for each.
+    `stamped`: only those that can carry the time of sending, and sinks wake for each. `first`: generator and sinks run
+    before everything else.
     """
 
     rate: float
     seconds: float
     burst: int = 1
     stamped: bool = False
+    first: bool = False
 
 
 def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Run:
-    with sink(*subject.destinations(), wakes=traffic.stamped) as receiver:
+    of_load, of_sink = (FIRST, FIRST) if traffic.first else (-10, -5)
+    with sink(*subject.destinations(), wakes=traffic.stamped, priority=of_sink) as receiver:
         if listening:
             listening.heard()  # what came before is no part of this run
         meter = Meter(subject)
@@ -77,6 +81,7 @@ def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Ru
             payloads=subject.contender.payloads,
             case=STAMPED_CASE if traffic.stamped else "",
             stamped=traffic.stamped,
+            priority=of_load,
         ) as generator:
             sent = generator.result()
         time.sleep(0.1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import subprocess
 import sys
 import time
 from contextlib import AbstractContextManager, suppress
@@ -62,6 +64,19 @@ class Subject(AbstractContextManager["Subject"]):
     def destinations(self) -> tuple[int, ...]:
         """The ports to which it sends each datagram."""
         return (self.ports.first, self.ports.second)[: self.contender.copies]
+
+    def conditions(self) -> dict[str, float]:
+        """What must be equal for a fair comparison, read from the running process.
+
+        `copies` of each datagram that leave, which sinks verify; `receive_buffer` of the first listener in bytes, as
+        the kernel counts it; `realtime`, 1 if any thread has a real-time priority.
+        """
+        words = ["ss", "--udp", "--all", "--memory", "--numeric", "--no-header", f"sport = :{self._port}"]
+        listed = subprocess.run(words, capture_output=True, text=True, check=True)
+        buffers = re.findall(r"\brb(\d+)", listed.stdout)
+        threads = (int(path.name) for pid in self.pids() for path in Path(f"/proc/{pid}/task").iterdir())
+        realtime = any(os.sched_getscheduler(thread) == os.SCHED_FIFO for thread in threads)
+        return {"copies": self.contender.copies, "receive_buffer": int(buffers[0]), "realtime": int(realtime)}
 
     def cpu_ns(self) -> int:
         """CPU time of all living threads: schedstat counts ns where utime and stime count ticks."""

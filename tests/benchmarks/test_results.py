@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import socket
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ def entry(cpu_us: float) -> dict[str, Any]:
         "router": [{"cpu_us@1000": cpu_us}],
         "peer": [{"cpu_us@1000": 10.0}],
     }
-    return results.entry(FIRST, rounds, judge(FIRST.aims, rounds), 4)
+    return results.entry(FIRST.title, rounds, judge(FIRST.aims, rounds), 4)
 
 
 def test_a_scenario_takes_its_old_place_and_leaves_the_others_alone(tmp_path: Path) -> None:
@@ -32,12 +33,13 @@ def test_a_scenario_takes_its_old_place_and_leaves_the_others_alone(tmp_path: Pa
     results.store(path, known)
     again = results.load(path)
     results.merge(again, FIRST.name, entry(20))
-    assert list(again["scenarios"]) == [FIRST.name, SECOND.name]
+    assert list(again["scenarios"]) == [SECOND.name, FIRST.name]
     assert again["scenarios"][SECOND.name] == known["scenarios"][SECOND.name]
     assert again["scenarios"][FIRST.name]["figures"][0]["verdict"] == "missed"
 
 
-def test_the_file_names_neither_this_machine_nor_its_folders() -> None:
+def test_the_file_names_neither_this_machine_nor_its_folders_nor_its_kernel() -> None:
     text = json.dumps(results.empty() | {"scenarios": entry(5)})
     assert socket.gethostname() not in text
     assert str(ROOT) not in text
+    assert platform.release() not in text

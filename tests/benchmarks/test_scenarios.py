@@ -16,7 +16,8 @@ from router.compiler import check_table
 def test_what_a_figure_is_compared_with_is_measured(scenario: Scenario) -> None:
     names = [contender.name for contender in scenario.contenders]
     assert len(set(names)) == len(names)
-    assert {aim.against for aim in scenario.aims} <= {*names[1:], None}
+    assert {aim.of for aim in scenario.aims} <= {*names}
+    assert {aim.against for aim in scenario.aims} <= {*names, None}
 
 
 @pytest.mark.parametrize("table", sorted(TABLES.glob("*.yaml")), ids=lambda path: path.stem)
