@@ -16,6 +16,8 @@ from benchmarks.versus.processes import cores, cpu_of_others, family, processes,
 
 START_SECONDS = 30
 STOP_SECONDS = 5
+POLICY = 38
+"""Where /proc/PID/stat has the scheduling policy, counted after the name of the program."""
 
 
 def _sockets_on(port: int) -> list[list[str]]:
@@ -74,8 +76,9 @@ class Subject(AbstractContextManager["Subject"]):
         words = ["ss", "--udp", "--all", "--memory", "--numeric", "--no-header", f"sport = :{self._port}"]
         listed = subprocess.run(words, capture_output=True, text=True, check=True)
         buffers = re.findall(r"\brb(\d+)", listed.stdout)
-        threads = (int(path.name) for pid in self.pids() for path in Path(f"/proc/{pid}/task").iterdir())
-        realtime = any(os.sched_getscheduler(thread) == os.SCHED_FIFO for thread in threads)
+        threads = (read(path) for pid in self.pids() for path in Path(f"/proc/{pid}/task").glob("*/stat"))
+        policies = [fields[POLICY] for thread in threads if (fields := thread.rpartition(")")[2].split())]
+        realtime = str(os.SCHED_FIFO) in policies
         return {"copies": self.contender.copies, "receive_buffer": int(buffers[0]), "realtime": int(realtime)}
 
     def cpu_ns(self) -> int:
