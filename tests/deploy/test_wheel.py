@@ -126,7 +126,8 @@ def test_the_carrier_comes_with_it_for_this_platform_and_any_python(wheel: Path,
 def test_the_licence_comes_with_it(packages: Path) -> None:
     [metadata] = packages.glob("rover_router-*.dist-info")
     assert "\nLicense-Expression: Apache-2.0\n" in (metadata / "METADATA").read_text()
-    assert (metadata / "licenses" / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    for name in ("LICENSE", "NOTICE"):
+        assert (metadata / "licenses" / name).read_bytes() == (ROOT / name).read_bytes()
 
 
 def test_without_a_compiler_it_is_for_any_platform_and_says_what_it_lacks(tmp_path: Path) -> None:
@@ -156,7 +157,7 @@ def moved(tmp_path: Path) -> Path:
     ignored = shutil.ignore_patterns("_assets", "__pycache__", "libcarrier.so", "declared.py")
     for name in ("router", "schemas"):
         shutil.copytree(ROOT / name, checkout / name, ignore=ignored)
-    for name in ("pyproject.toml", "hatch_build.py", "LICENSE"):
+    for name in ("pyproject.toml", "hatch_build.py", "LICENSE", "NOTICE"):
         shutil.copy(ROOT / name, checkout / name)
     shutil.copytree(tables.ROUTES, checkout / "routes")
     shutil.copytree(tables.PROTOS, checkout / "upstream")

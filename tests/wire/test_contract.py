@@ -1,4 +1,4 @@
-"""`protos/` says what the contract of the existing system says: files, names, numbers, types."""
+"""`protos/` has the files, names, numbers and types of ERC-Protobufs at a303ae3 (see NOTICE), which contract.txt lists."""
 
 from __future__ import annotations
 
