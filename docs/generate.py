@@ -64,6 +64,19 @@ Every series exists at 0 from the start. The counters balance. Per listener, rec
 and target, accepted = delivered + dropped + filtered + collected + waiting + held. Held messages are in open frames,
 in the queue of a `bandwidth`, or held by `on_limit: latest`. Delivered means sent or published. With `for_each`, each
 element is a message. A deadman's datagrams are counted only in its own metrics, and their bytes nowhere."""
+_UNCOUNTED = """\
+The counters begin when a message has reached the router and end when it was handed to the kernel or to DDS. They do
+not see:"""
+_LOSSES = {
+    "datagrams lost in the network, on the way to this computer or from it": "An endpoint that falls silent is a "
+    "problem. Datagrams for which a listener's buffer has no room are counted in `router_kernel_drops_total`.",
+    "messages that DDS loses between a publisher and the router, or between the router and a subscriber": "Nothing in "
+    "the router: a topic counts a message as delivered when DDS has taken it. DDS may lose best-effort messages, and "
+    "older ones than the queue holds. Compare with `router listen topic://NAME`.",
+    "messages of publishers with another type": "DDS delivers none. `router_type_incompatible` counts these "
+    "publishers and subscribers, and each is a problem.",
+    "messages of publishers with incompatible QoS": "DDS delivers none. `router_qos_incompatible` counts the peers.",
+}
 _COMMANDED = """\
 `command` is `true` for messages that go to a board or feed a deadman, and for messages of gateway clients if `inbound`
 has a `ttl` or a deadman; else `false`."""
@@ -133,6 +146,14 @@ def metrics_page() -> str:
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
         *_reasons("router_messages_dropped_total", DROP_REASONS),
+        "## What is not counted",
+        "",
+        fill(_UNCOUNTED, WIDTH),
+        "",
+        "| not seen | what shows it |",
+        "|---|---|",
+        *(f"| {loss} | {shown} |" for loss, shown in _LOSSES.items()),
+        "",
         "## Gateways",
         "",
         fill(_GATEWAYS, WIDTH),

@@ -94,6 +94,8 @@ class SchemaPage:
         self.schema = schema
         self.sections = sections
         self.headings = {section.schema.removeprefix("definitions."): section.heading for section in sections}
+        complete = schema["definitions"].get("complete", {"else": {"required": []}})
+        self.of_routes = complete["else"]["required"]
         self.required = dict(self._required(schema["definitions"].get("complete", {}), "definitions.complete"))
 
     def lines(self) -> Iterator[str]:
@@ -123,6 +125,8 @@ class SchemaPage:
                 meaning = re.sub(r"(?<=\w\.) [A-Z].*", "", meaning)
             if key in required:
                 value += "; required"
+                if found is self.schema and key in self.of_routes:
+                    value += ", unless the table has gateways only"
             elif "default" in key_schema:
                 value += f"; by default `{flow(key_schema['default'])}`"
             yield Row(path, value, prose(meaning))
