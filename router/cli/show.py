@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from router.tools.show import Entry
 
 _DESCRIPTION = """Print a recording: what the router received, rejected and dropped, what it sent by itself, and when
-deadmen tripped. With --why, print for each deadman that tripped when that was, why, and what last fed it. Neither the
+deadman timers tripped. With --why, print for each of these when that was, why, and what last fed it. Neither the
 table nor a running router is needed. Times are local, with milliseconds; times in file names are UTC."""
 _EXAMPLES = (
     "router show it.mcap --why",

@@ -166,7 +166,9 @@ def _envelope_findings(
     board = next((name for name in names if table.endpoints[name].kind is EndpointKind.BOARD), None)
     empty = [member.name for member in beside if not member.is_required]
     if board is not None and empty and table.envelope.because is None:
-        message = f"nothing fills {', '.join(empty)} of {envelope.name} in envelopes for '{board}' from ROS or deadmen"
+        message = (
+            f"nothing fills {', '.join(empty)} of {envelope.name} in envelopes for '{board}' from ROS or deadman timers"
+        )
         hint = "a board that checks them obeys only forwarded envelopes; if none does, add `because: why` to 'envelope'"
         yield Diagnostic(span, Code.EMPTY_FIELD, message, hint)
 

@@ -85,7 +85,7 @@ def _ignore_sim_time(node: Node) -> None:
     """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
     if node.get_parameter(_SIM_TIME).value:
         logger.warning(
-            f"{_SIM_TIME} is ignored: the router uses real time (stamps, ttl, deadmen)",
+            f"{_SIM_TIME} is ignored: the router uses real time (stamps, ttl, deadman timers)",
             remedy=f"leave {_SIM_TIME} out for this node, or set it to false (docs/guides/ros-workspace.md)",
         )
         node.set_parameters([Parameter(_SIM_TIME, value=False)])

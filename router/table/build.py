@@ -404,7 +404,7 @@ def _with_timeout(deadman: Entry) -> MappingNode:
     """Return the settings of a deadman. Raises InvalidValueError if neither they nor the defaults have a timeout."""
     settings = mapping(deadman.value)
     if settings.get("timeout") is None:
-        hint = "set it here, or for all deadmen with `defaults: {deadman: {timeout: 500ms}}`"
+        hint = "set it here, or for all deadman timers with `defaults: {deadman: {timeout: 500ms}}`"
         what = "'deadman' lacks the key 'timeout'"
         raise InvalidValueError(deadman.key.span, Code.MISSING_KEY, what, hint)
     return settings
