@@ -1,4 +1,4 @@
-"""`protos/` has the files, names, numbers and types of ERC-Protobufs at a303ae3 (see NOTICE), which contract.txt lists."""
+"""`protos/` has what contract.txt lists: files, names, numbers and types of ERC-Protobufs at a303ae3 (see NOTICE)."""
 
 from __future__ import annotations
 
