@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import shlex
 import signal
 import sys
@@ -102,7 +101,6 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def report(args: argparse.Namespace, found: Rounds) -> dict[str, Any]:
-    machine = {"kernel": platform.release(), "machine": platform.machine(), "cores": os.cpu_count()}
     settings = {name: getattr(args, name) for name in ("command", "vs", "rate", "seconds", "repeat", "seed")}
     summary = {
         subject: {pressure: {**one._asdict(), "verdict": figures.verdict(one)} for pressure, one in each.items()}
@@ -112,7 +110,7 @@ def report(args: argparse.Namespace, found: Rounds) -> dict[str, Any]:
         subject: {pressure: [one._asdict() for one in each] for pressure, each in pressures.items()}
         for subject, pressures in found.items()
     }
-    return {"machine": machine, "settings": settings, "summary": summary, "rounds": rounds}
+    return {"machine": results.machine(), "settings": settings, "summary": summary, "rounds": rounds}
 
 
 def subjects(args: argparse.Namespace, folder: Path) -> list[Command]:
