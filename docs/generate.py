@@ -216,7 +216,7 @@ def readme() -> str:
     """The README, with the table of figures made from the results of `make bench`."""
     text = (HERE / README).read_text(encoding="utf-8")
     found = json.loads(RESULTS.read_text(encoding="utf-8"))
-    begin, end = "<!-- Made by docs/generate.py: -->\n", "<!-- End. -->\n"
+    begin, end = "<!-- Made by docs/generate.py: -->\n\n", "\n<!-- End. -->\n\n"
     before, _, rest = text.partition(begin)
     after = rest.partition(end)[2]
     return f"{before}{begin}{claims.table(found)}{end}{after}"
