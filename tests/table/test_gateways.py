@@ -29,13 +29,15 @@ def test_a_gateway_is_typed(tmp_path: Path) -> None:
         "rates": "/rover/imu: 50 Hz, /tf: each, /slow: 0.5 Hz", "max_datagram": "8 kB", "max_message": "1 MiB",
         "max_clients": "1024", "max_clients_per_host": "16",
         "inbound.0.topic.topic": "/cmd_vel", "inbound.0.topic.type": "geometry_msgs/msg/Twist",
-        "inbound.0.topic.qos.depth": "3", "inbound.0.ttl": "300 ms", "inbound.0.max_lead": "2 s", "inbound.0.topic.max_rate": "20 Hz",
+        "inbound.0.topic.qos.depth": "3", "inbound.0.ttl": "300 ms", "inbound.0.max_lead": "2 s",
+        "inbound.0.topic.max_rate": "20 Hz",
         "inbound.0.topic.on_limit": "first", "inbound.0.deadman.timeout": "500 ms",
             "inbound.0.deadman.repeat": "100 ms",
         "inbound.0.deadman.at_start": "send", "inbound.0.deadman.send": "{linear.x: 0.0, angular.z: 1}",
         "inbound.1.topic.topic": "/stop", "inbound.1.topic.type": "std_msgs/msg/Empty",
             "inbound.1.topic.on_limit": "first",
-        "inbound.1.max_lead": "2 s", "inbound.1.deadman.timeout": "1 s", "inbound.1.deadman.repeat": "50 ms", "inbound.1.deadman.at_start": "send",
+        "inbound.1.max_lead": "2 s", "inbound.1.deadman.timeout": "1 s",
+        "inbound.1.deadman.repeat": "50 ms", "inbound.1.deadman.at_start": "send",
         "inbound.1.deadman.send": "{}",
     }  # fmt: skip
     assert found.max_outbound == 1 << 20
