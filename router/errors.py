@@ -361,6 +361,10 @@ def one_of(names: Sequence[str]) -> str:
     quoted = [f"'{name}'" for name in names[:MOST_MEANT]]
     if not quoted:
         return ""
-    if len(names) > MOST_MEANT:
-        return f"did you mean {', '.join(quoted)} or another one?"
-    return f"did you mean {' or '.join([', '.join(quoted[:-1]), quoted[-1]] if quoted[:-1] else quoted)}?"
+    return f"did you mean {listed([*quoted, 'another one'] if len(names) > MOST_MEANT else quoted, 'or')}?"
+
+
+def listed(names: Sequence[str], conjunction: str = "and") -> str:
+    """Return the names as in a sentence: `a, b and c`."""
+    *others, last = names
+    return f"{', '.join(others)} {conjunction} {last}" if others else last

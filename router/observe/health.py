@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, pairwise
+from math import inf
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import (
@@ -26,6 +27,7 @@ from router.compiler.metrics import (
     Mismatch,
     only,
 )
+from router.errors import listed
 from router.observe.bursts import Burst
 from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
@@ -313,7 +315,7 @@ class Look:
             if route in self.halted:
                 kind, more, remedy = Kind.HALTED, f" for {age_text(seconds)}", ""
                 if silent := self.away[route]:
-                    more += f", and {' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} silent"
+                    more += f", and {listed(silent)} {'is' if len(silent) == 1 else 'are'} silent"
             more += "".join(f"; {board} stopped after {time:.2f} s" for board, time in self._stopped(route))
             problem = self._problem(kind, {"route": route}, more, (self._owner(route),))
             yield problem._replace(remedy=remedy or problem.remedy)
@@ -327,7 +329,7 @@ class Look:
         if sources and sources <= self._stale:
             names = sorted(sources)
             verb = "is" if len(names) == 1 else "are"
-            return f", and {' and '.join(names)} {verb} silent", self._remedy_for_silence(names[0])
+            return f", and {listed(names)} {verb} silent", self._remedy_for_silence(names[0])
         dropped = sorted(self.grown(Kind.MESSAGES_DROPPED.metric), key=lambda found: -found[1])
         for (of, target, reason), count in dropped:
             if of == self._owner(route) and reason not in _NO_LOSS and self._are_commands(of, target):
@@ -383,7 +385,7 @@ class Look:
                 found[host, process][shares].append(name)
         for (host, process), shared in found.items():
             topics, nodes = shared[SHARES_TOPIC], shared[SHARES_NODE]
-            more = f"; boards of both get messages on {' and '.join(topics)} twice" if topics else ""
+            more = f"; boards of both get messages on {listed(topics)} twice" if topics else ""
             more += "".join(f"; both are called {name}" for name in nodes)
             routes = tuple(plan.route for topic in topics for plan in self.program.outbound.get(topic, ()))
             yield self._problem(Kind.OTHER_ROUTER, {"host": host, "process": process}, more, routes)
@@ -404,7 +406,7 @@ class Look:
     def _lost(self, kind: Kind) -> Iterator[Problem]:
         """Yield unintended losses of the last seconds, summed over the labels that the words do not contain.
 
-        Losses towards a silent endpoint are left out where its silence is a problem, which names them.
+        Losses towards an endpoint that is silent, or was, are left out where its silence is a problem.
         """
         sums: dict[Labels, Counter[str]] = defaultdict(Counter)
         for metric in (kind.metric, *(_ALSO_LOST if kind is Kind.RECORDING_INCOMPLETE else ())):
@@ -423,7 +425,9 @@ class Look:
         if kind is Kind.UNHANDLED_CASE:
             return labels["payload_case"] == UNKNOWN_CASE
         target = labels.get("target", "")
-        return labels.get("reason") in UNSENT_REASONS and target in self._stale and self.was_heard(target)
+        was_silent = self.returned.get(target, inf) < self.seconds
+        is_silent = target in self._stale and self.was_heard(target)
+        return labels.get("reason") in UNSENT_REASONS and (is_silent or was_silent)
 
     def _loss(self, kind: Kind, labels: Mapping[str, str], counts: Counter[str]) -> Problem:
         routes = tuple(route for route, _ in counts.most_common() if route)
@@ -451,7 +455,7 @@ class Look:
         routes = [route for route in self.program.table.routes if route.case.value == case]
         topics = list(dict.fromkeys(topic.topic.value for route in routes for topic in route.source_topics))
         if topics:
-            more += f": it is accepted only from {'topic' if len(topics) == 1 else 'topics'} {' and '.join(topics)}"
+            more += f": it is accepted only from {'topic' if len(topics) == 1 else 'topics'} {listed(topics)}"
         if senders := self._senders.of(case):
             more += f"{'; ' if topics else ': '}{few(senders)} sent it"
         problem = self._problem(Kind.UNHANDLED_CASE, labels, more, tuple(route.name for route in routes))

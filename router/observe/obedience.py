@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from router.compiler.metrics import Answer, Evidence
 from router.compiler.program import Program
 from router.datagrams import Wire
-from router.errors import DecodeError
+from router.errors import DecodeError, listed
 from router.log import logger
 from router.values import protobuf_tree, words
 
@@ -77,7 +77,7 @@ def why_disobeyed(program: Program, route: str, board: str, replies: Replies) ->
     deadman = next((each.deadman for each in program.table.routes if each.name == route), None)
     if deadman is None or deadman.obeyed is None:  # a reload has removed it meanwhile
         return ""
-    sent, case = " and ".join(map(str, deadman.payloads)), deadman.obeyed.case.value
+    sent, case = listed([*map(str, deadman.payloads)]), deadman.obeyed.case.value
     said = replies.get((route, board), Reply()).said
     return f"it was sent {sent}, and {f'says {said}' if said else f'has sent no {case} since'}"
 

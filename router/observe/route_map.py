@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from router.compiler.metrics import CLIENTS
 from router.compiler.program import Program
 from router.compiler.topics import resolved
+from router.errors import listed
 from router.table.keys import phrases
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
 from router.table.units import duration
@@ -86,7 +87,7 @@ def deadman_edges(program: Program) -> Iterator[Edge]:
     """
     for route in program.table.routes:
         if route.deadman is not None:
-            about = f"the deadman sends {' and '.join(each.case.value for each in route.deadman.payloads)}"
+            about = f"the deadman sends {listed([each.case.value for each in route.deadman.payloads])}"
             for name in (to.value for to in route.deadman.to):
                 yield Edge(f"case:{route.case.value}", f"to:@{name}", route.name, name, about)
     for gateway in program.gateways:

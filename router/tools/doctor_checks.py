@@ -20,7 +20,7 @@ from typing import NamedTuple
 from router.assets import asset
 from router.carrier.library import load
 from router.compiler.program import Program
-from router.errors import Located, StartError, plural, shown_path
+from router.errors import Located, StartError, listed, plural, shown_path
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable
@@ -446,13 +446,13 @@ def ros_peers(program: Program) -> Iterator[CheckResult]:
             "a",
             f"if it runs this table, add an `http.address`, so that doctor can ask it; if not, {remedy}",
         )
-    shared: dict[str, list[str]] = {}
-    for each in sorted(found.shared):
-        router = f"{which} router runs, process {each.router.process} on {each.router.host}"
-        what = "has the name of its node" if each.is_node else f"takes messages from {each.name}"
-        shared.setdefault(router, []).append(what)
-    for router, whats in shared.items():
-        yield warning("ROS", f"{router}: it {' and '.join(whats)}", remedy)
+    for router in sorted({each.router for each in found.shared}):
+        theirs = sorted(each for each in found.shared if each.router == router)
+        topics = [each.name for each in theirs if not each.is_node]
+        whats = ["has the name of its node"] * any(each.is_node for each in theirs)
+        whats += [f"takes messages from {listed(topics)}"] * bool(topics)
+        what = f"{which} router runs, process {router.process} on {router.host}: it {listed(whats)}"
+        yield warning("ROS", what, remedy)
     if found.namesakes:
         name = program.table.node.name
         yield warning("ROS", f"another node is called {name}", "stop it, or give one of them another name")

@@ -195,7 +195,7 @@ class Stop:
 
     def _last_fed(self) -> str:
         if self.fed is None:
-            return f"never since {_clock(self.begin)}, where the recording begins"
+            return f"never since {_clock(self.begin)}, where the recording begins; the one before it may show it"
         if self._topic:
             return f"{_clock(self.fed.at)} by a client's message"
         source = f" from {self.fed.sender}" if self.fed.sender else ""

@@ -418,6 +418,20 @@ def test_losses_towards_an_endpoint_that_is_silent_are_told_with_its_silence_and
     assert dropped.labels["reason"] == "stale"
 
 
+def test_losses_towards_an_endpoint_that_was_silent_are_told_with_its_return(router: Counting) -> None:
+    router.hear("driving_board")
+    router.look(1)
+    router.count("endpoint_silences", "driving_board", to=1)
+    lost_for(router, "manual_drive", "driving_board", 40)
+    told = [problem.kind for problem in router.look(1).problems]
+    assert Kind.ENDPOINT_RETURNED in told
+    assert Kind.COMMANDS_DROPPED not in told
+    router.look(20)
+    router.hear("driving_board")
+    lost_for(router, "manual_drive", "driving_board", 80)
+    assert Kind.COMMANDS_DROPPED in [problem.kind for problem in router.look(1).problems]
+
+
 def test_losses_towards_an_endpoint_that_was_never_heard_have_the_remedy_of_its_silence(router: Counting) -> None:
     router.hear("basestation")
     lost_for(router, "manual_drive", "driving_board", 40)

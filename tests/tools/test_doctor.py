@@ -126,9 +126,15 @@ def test_what_a_router_would_meet_in_its_ros_domain_is_said_before_its_start(tab
         wait_until(lambda: of_ros(before_start) == met)  # discovery may take longer on a busy computer
         wait_until(lambda: set(met) <= set(of_ros(examine)))
         rewritten(table, next(line for line in table.read_text().splitlines() if line.startswith("http: ")), "")
-        [of_any_table] = [each for each in ros_peers(compiled(table)) if who in each.text]
-        assert of_any_table.text.startswith(f"a router runs, {who}: it has the name of its node")
-        assert of_any_table.remedy.startswith("if it runs this table, add an `http.address`")
+        of_any_table: list[CheckResult] = []
+
+        def is_met() -> bool:
+            of_any_table[:] = [each for each in ros_peers(compiled(table)) if who in each.text]
+            return bool(of_any_table)
+
+        wait_until(is_met)
+        assert of_any_table[0].text.startswith(f"a router runs, {who}: it has the name of its node")
+        assert of_any_table[0].remedy.startswith("if it runs this table, add an `http.address`")
     assert of_ros(before_start) == []
 
 
@@ -318,12 +324,12 @@ def test_only_our_recordings_make_room_for_new_ones(
     table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 250 << 20))
-    for name in ("table_20260412T101500.000000Z.mcap", "somebody_elses.mcap"):
+    for name in ("table_000001_20260412T101500.000000Z.mcap", "somebody_elses.mcap"):
         with (tmp_path / name).open("wb") as file:
             file.truncate(6 << 20)
     program = recorded(table, tmp_path, "260MiB")
     assert gist(recordings(program, running=False)) == [(Grade.WARNING, True)]
-    (tmp_path / "table_20260412T101500.000000Z_signal.mcap").write_bytes(bytes(4 << 20))
+    (tmp_path / "table_000002_20260412T101500.000000Z_signal.mcap").write_bytes(bytes(4 << 20))
     assert gist(recordings(program, running=False)) == [(Grade.FINE, True)]
 
 
