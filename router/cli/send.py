@@ -28,7 +28,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "send", description, *_EXAMPLES)
     completes(parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info"), cases)
     completes(
-        parser.add_argument("fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, state=NAME"),
+        parser.add_argument(
+            "fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, counts[left]=4, state=NAME"
+        ),
         fields,
     )
     completes(

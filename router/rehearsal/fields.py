@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Union
+from typing import Any, Union
 
 from google.protobuf.message import Message
 
@@ -23,7 +23,7 @@ from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNod
 from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
-from router.values import ZEROS, parse, scalar_text
+from router.values import elements, parse, scalar_text, zero
 
 ANY = "any"
 RECEIVED_AT = "received_at"
@@ -124,7 +124,7 @@ class Elements:
             found = f"{len(actual)} elements {shown(kind, actual)}" if len(actual) else "empty"
             yield Difference(path, f"{len(self.items)} elements", found, self.span)
             return
-        for index, (item, value) in enumerate(zip(self.items, _elements(kind, actual), strict=True)):
+        for index, (item, value) in enumerate(zip(self.items, elements(kind, actual), strict=True)):
             yield from item.differences((*path, index), kind.element, value, now)
 
 
@@ -327,7 +327,7 @@ def _default_of(kind: Type, default: object = None) -> Any:
             return {field.name: _default_of(field.type, field.default) for field in kind.fields}
         case List():
             return [_default_of(kind.element) for _ in range(kind.length or 0)]
-    return ZEROS[type(kind)]
+    return zero(kind)
 
 
 def _is_unset(holder: Any, field: Field, value: Any) -> bool:
@@ -340,7 +340,7 @@ def _is_default(kind: Type, value: Any, default: Any) -> bool:
     if isinstance(kind, MessageType):
         return all(_is_default(field.type, getattr(value, field.name), default[field.name]) for field in kind.fields)
     if isinstance(kind, List):
-        same = zip(_elements(kind, value), default, strict=False)
+        same = zip(elements(kind, value), default, strict=False)
         return len(value) == len(default) and all(_is_default(kind.element, one, other) for one, other in same)
     return _same(kind, default, value)
 
@@ -354,22 +354,6 @@ def _same(kind: Type, expected: Any, actual: Any) -> bool:
     if isinstance(kind, Int):
         return int(expected) == int(actual)
     return bool(expected == actual)
-
-
-class _Entry(NamedTuple):
-    """One entry of a protobuf map."""
-
-    key: Any
-    value: Any
-
-
-def _elements(kind: List, value: Any) -> Sequence[Any]:
-    """Return the elements of a list; for a protobuf map, its entries sorted by key."""
-    element = kind.element
-    if isinstance(element, MessageType) and element.is_map_entry:
-        return [_Entry(key, value[key]) for key in sorted(value)]  # its own order differs from run to run
-    elements: Sequence[Any] = value
-    return elements
 
 
 def _time_of(kind: MessageType, value: Any) -> int:
@@ -391,7 +375,7 @@ def shown(kind: Type, value: Any) -> str:
             inner = (f"{f.name}: {shown(f.type, member)}" for f, member in members if not _is_unset(value, f, member))
             return f"{{{', '.join(inner)}}}"
         case List():
-            return f"[{', '.join(shown(kind.element, item) for item in _elements(kind, value))}]"
+            return f"[{', '.join(shown(kind.element, item) for item in elements(kind, value))}]"
         case String():
             return repr(value)
         case _:
@@ -409,7 +393,7 @@ def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]
             if not is_submessage or value.HasField(field.name):
                 yield from leaves(field.type, getattr(value, field.name), (*path, field.name))
     elif isinstance(kind, List):
-        for index, element in enumerate(_elements(kind, value)):
+        for index, element in enumerate(elements(kind, value)):
             yield from leaves(kind.element, element, (*path, index))
     else:
         yield path_text(path), shown(kind, value)

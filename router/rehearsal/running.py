@@ -99,11 +99,14 @@ def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, byt
 
 
 def _datagram(given: Given, wire: Wire, now: int) -> bytes:
-    """Return the bytes that arrive. Raises InvalidValueError if they are longer than `pad`."""
+    """Return the bytes that arrive.
+
+    Raises InvalidValueError if they are longer than `pad`, or if the payload lacks a required field.
+    """
     data = given.data or b""
-    if given.case is not None and given.fields is not None:
-        data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
     try:
+        if given.case is not None and given.fields is not None:
+            data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
         return framed(data, given.trim, given.pad)
     except UsageError as error:
         raise invalid(given.span, Code.BAD_VALUE, str(error)) from error

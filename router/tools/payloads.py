@@ -133,6 +133,26 @@ def _manual_brake(now: Pose, noise: Noise) -> Values:
     return {"brake": False}
 
 
+def _timestamp(now: Pose, noise: Noise) -> Values:
+    return _seconds(now.epoch + now.t)
+
+
+def _duration(now: Pose, noise: Noise) -> Values:
+    """Since the start."""
+    return _seconds(now.t)
+
+
+def _seconds(seconds: float) -> Values:
+    """In whole microseconds, as a float has no more digits for the wall clock."""
+    whole, microseconds = divmod(round(seconds * 1e6), 1_000_000)
+    return {"seconds": whole, "nanos": 1000 * microseconds}
+
+
+def _any(now: Pose, noise: Noise) -> Values:
+    """Nothing: which types the receiver knows is not known here."""
+    return {"type_url": "", "value": b""}
+
+
 MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "SensorBoardIMUInfo": _imu,
     "SensorBoardGPSInfo": _gps,
@@ -143,6 +163,9 @@ MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "MotorInformation": _motor,
     "BasestationManualDrive": _manual_drive,
     "BasestationManualBrake": _manual_brake,
+    "google.protobuf.Timestamp": _timestamp,
+    "google.protobuf.Duration": _duration,
+    "google.protobuf.Any": _any,
 }
 """Functions that return the modelled fields, by protobuf message; all other fields vary as their types allow."""
 
@@ -192,7 +215,7 @@ class PayloadModel:
         self._phases: dict[str, float] = {}
 
     def fill(self, message: Message, now: Pose) -> None:
-        """Set every field of an empty message."""
+        """Set every field of an empty message, down to a depth of NESTING; below that, only required ones."""
         self._fill(message, self._kind, now, self._name, NESTING)
 
     def _fill(self, message: Any, kind: MessageType, now: Pose, path: str, depth: int) -> None:
@@ -201,24 +224,35 @@ class PayloadModel:
         for field in kind.fields:
             if field.name in values:
                 setattr(message, field.name, values[field.name])
-            else:
+            elif depth >= 0 or field.is_required:
                 self._fill_field(message, field, now, f"{path}.{field.name}", depth)
 
     def _fill_field(self, message: Any, field: Field, now: Pose, path: str, depth: int) -> None:
         member = getattr(message, field.name)
         if isinstance(field.type, MessageType):
             member.SetInParent()
-            if depth:
-                self._fill(member, field.type, now, path, depth - 1)
+            self._fill(member, field.type, now, path, depth - 1)
         elif not isinstance(field.type, List):
             setattr(message, field.name, self._value(field.type, now, path))
+        elif field.type.entry is not None:
+            self._fill_map(member, field.type, now, path, depth)
         elif isinstance(field.type.element, MessageType):
-            for index in range(self._length(field.type, path) if depth else 0):
+            for index in range(self._length(field.type, path) if depth > 0 else 0):
                 self._fill(member.add(), field.type.element, now, f"{path}[{index}]", depth - 1)
         else:
             element = field.type.element
             length = self._length(field.type, path)
             member.extend(self._value(element, now, f"{path}[{index}]") for index in range(length))
+
+    def _fill_map(self, member: Any, kind: List, now: Pose, path: str, depth: int) -> None:
+        assert kind.entry is not None  # noqa: S101 - it is a map
+        key, content = (field.type for field in kind.entry.fields)
+        for index in range(self._length(kind, path) if depth > 0 else 0):
+            at = _key(key, index)
+            if isinstance(content, MessageType):
+                self._fill(member.get_or_create(at), content, now, f"{path}[{index}]", depth - 1)
+            else:
+                member[at] = self._value(content, now, f"{path}[{index}]")
 
     def _value(self, kind: Type, now: Pose, path: str) -> object:
         """Return a value of a scalar type: waves of half a minute, each path with a phase of its own."""
@@ -258,6 +292,13 @@ def _usual_length(kind: List) -> int:
 
 def _without_indexes(path: str) -> str:
     return re.sub(r"\[\d+\]", "", path)
+
+
+def _key(kind: Type, index: int) -> object:
+    """Return the key of a map's entry at this index."""
+    if isinstance(kind, String):
+        return str(index)
+    return bool(index % 2) if isinstance(kind, Bool) else index
 
 
 def _enum_value(kind: Enum, wave: float) -> int:

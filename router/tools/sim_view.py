@@ -6,14 +6,13 @@ from collections import defaultdict, deque
 from collections.abc import Iterator
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict
 from rich.table import Table
 from rich.text import Text
 
 from router.datagrams import Wire
 from router.tools.board import Arrivals, Change, State
 from router.tools.simulator import Statistics
-from router.values import compact, rate_text
+from router.values import compact, protobuf_json, rate_text
 
 DIGITS = 4
 
@@ -145,7 +144,7 @@ class SimView:
         inboxes = self._statistics.inboxes
         received: dict[str, dict[str, Any]] = defaultdict(dict)
         for (endpoint, case), arrivals in self._arrivals():
-            last = MessageToDict(arrivals.last, preserving_proto_field_name=True)
+            last = protobuf_json(arrivals.last)
             age = round(seconds - arrivals.at, 3)
             received[endpoint][case] = {"count": arrivals.count, "age": age, "last": last}
         return {

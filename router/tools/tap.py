@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Any
 
-from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
 from router.carrier.conditions import NativeCondition
@@ -30,7 +29,7 @@ from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase
-from router.values import clock_text, compact, one_line, ros_json, ros_tree, words
+from router.values import clock_text, compact, one_line, protobuf_json, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.ros.topics import TopicListener
@@ -67,7 +66,7 @@ class Condition:
     def holds(self, case: str, payload: Message, source: str, received_at: int) -> bool:
         if (condition := self._conditions.get(case)) is None:
             return False
-        holds = condition.holds(payload.SerializeToString(), source, received_at)
+        holds = condition.holds(payload.SerializePartialToString(), source, received_at)
         if holds is None:
             self.failure = self.failure or f"{case}: for example, because of a division by zero"
         return bool(holds)
@@ -146,7 +145,7 @@ class TappedDatagram:
             document["problem"] = self.problem
         else:
             document["case"] = self.decoded.case.name
-            document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
+            document["fields"] = protobuf_json(self.decoded.message)
             document["zeros_restored"] = self.decoded.zeros
             if self.decoded.superseded:
                 document["superseded"] = self.decoded.superseded
@@ -204,7 +203,7 @@ class ShownAction:
         document |= {key: text for key, text in texts.items() if text}
         if self.decoded is not None:
             document["case"] = self.decoded.case.name
-            document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
+            document["fields"] = protobuf_json(self.decoded.message)
         return json.dumps(document)
 
 

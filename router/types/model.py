@@ -87,6 +87,11 @@ class List:
     length: int | None = None
     bound: int | None = None
 
+    @property
+    def entry(self) -> MessageType | None:
+        """The type of an entry of a protobuf map, with its key and its value; None for other lists."""
+        return self.element if isinstance(self.element, MessageType) and self.element.is_map_entry else None
+
     def __str__(self) -> str:
         size = str(self.length) if self.length is not None else f"<={self.bound}" if self.bound is not None else ""
         return f"{self.element}[{size}]"
