@@ -51,12 +51,18 @@ class Wire:
         return self.envelope.cases[name]
 
     def encode(self, case: PayloadCase, payload: Message) -> bytes:
-        """Return the exact encoding of an envelope with this payload."""
+        """Return the exact encoding of an envelope with this payload. All other fields of the envelope are empty.
+
+        Raises UsageError if the payload lacks a required field.
+        """
+        if not payload.IsInitialized():
+            fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
+            raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
         outer = self.envelope.message_class()
         inner = getattr(outer, case.name)
         inner.SetInParent()
         inner.CopyFrom(payload)
-        return outer.SerializeToString()
+        return outer.SerializePartialToString()
 
     def decode(self, datagram: bytes) -> Decoded:
         """Parse a datagram as a listener with `framing: zero_trimmed` does.
@@ -72,7 +78,9 @@ class Wire:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
-        name = outer.WhichOneof(self.envelope.oneof) if self.envelope.cases else None
+        name = outer.WhichOneof(self.envelope.oneof) if self.envelope.cases or self.envelope.unroutable else None
+        if (other := self.envelope.unroutable.get(name or "")) is not None:
+            raise DecodeError(f"unhandled: {name} is {other.type}, not a message")
         if name is None:
             reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
@@ -129,14 +137,15 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
 
 
 def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
-    """Return the payload cases of a datagram in order. The last one is its payload; consecutive pieces count as one.
+    """Return the members of the oneof in a datagram in order. The last one counts; consecutive pieces are one.
 
     Raises protobuf's DecodeError.
     """
-    names = {case.number: case.name for case in envelope.cases.values()}
+    names = {(case.number, LEN): case.name for case in envelope.cases.values()}
+    names |= {(member.number, member.wire_type): name for name, member in envelope.unroutable.items()}
     fields = UnknownFieldSet(Empty.FromString(restored(data) if repairs else data))
-    members = [fields[index].field_number for index in range(len(fields)) if fields[index].wire_type == LEN]
-    return [name for name, _ in groupby(names[number] for number in members if number in names)]
+    members = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
+    return [name for name, _ in groupby(names[member] for member in members if member in names)]
 
 
 def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tuple[str, str]:

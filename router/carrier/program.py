@@ -57,7 +57,7 @@ def native_program(program: Program, generation: int, outlets: Outlets) -> Nativ
     made.structure = c.Program(
         generation=generation,
         listener_count=len(program.listeners),
-        case_count=len(program.envelope.cases),
+        case_count=len(program.envelope.numbers),
         unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
         schema=ctypes.pointer(wire_schema(program.envelope, program.inbound.keys(), made.arrays)),
         listeners=made.arrays.array(c.Listener, writer.listeners()),
@@ -98,16 +98,16 @@ class _Writer:
     # senders and payload cases
 
     def cases(self) -> list[c.PayloadCase]:
-        cases = sorted(self.program.envelope.cases.values(), key=lambda case: case.number)
+        members = sorted((number, name) for name, number in self.program.envelope.numbers.items())
         rows = {number: row for row, number in enumerate(self.program.inbound)}
         return [
             c.PayloadCase(
-                number=case.number,
-                row=rows.get(case.number, -1),
-                is_ignored=case.number in self.program.ignored,
-                unhandled=self.counters.index("unhandled", case.name),
+                number=number,
+                row=rows.get(number, -1),
+                is_ignored=number in self.program.ignored,
+                unhandled=self.counters.index("unhandled", name),
             )
-            for case in cases
+            for number, name in members
         ]
 
     def listeners(self) -> list[c.Listener]:

@@ -32,7 +32,7 @@ _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.
 def wire_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
     """Make the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
-    flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
+    flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
     indexes = all_types(descriptor)
     types = []
     for each, index in indexes.items():
@@ -56,7 +56,7 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
     if kind in {WireKind.MESSAGE, WireKind.GROUP}:
         return c.WireField(number=field.number, kind=kind, flags=flags, type=indexes[message_of(field)])
     is_packable = field.is_repeated and kind in {WireKind.VARINT, WireKind.I64, WireKind.I32}
-    return c.WireField(number=field.number, kind=kind, flags=WireFlag.PACKABLE if is_packable else 0)
+    return c.WireField(number=field.number, kind=kind, flags=flags | WireFlag.PACKABLE if is_packable else flags)
 
 
 def _kind(field: FieldDescriptor) -> WireKind:

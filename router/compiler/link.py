@@ -49,7 +49,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
-        ignored=frozenset(each.case.number for each in checked.routes if each.route.ignore),
+        ignored=frozenset(envelope.numbers[route.case.value] for route in table.routes if route.ignore),
         protos=schema,
         lowered=lowered,
         boards=checked.boards,

@@ -96,7 +96,11 @@ class Lookup:
 
     def case(self, name: Located[str]) -> PayloadCase | None:
         found = self.envelope.cases.get(name.value)
-        if found is None:
+        if (other := self.envelope.unroutable.get(name.value)) is not None:
+            message = f"no route can take '{name.value}': it is {other.type}, not a message"
+            hint = "wrap it in a message of its own, or ignore it with `ignore: reason`"
+            self.report(name.span, Code.BAD_PROTO, message, hint)
+        elif found is None:
             message = f"{self.envelope.name} has no payload case '{name.value}'"
             hint = did_you_mean(name.value, self.envelope.cases)
             self.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)

@@ -159,7 +159,8 @@ class Program:
     """A compiled table. `senders` are all endpoints that are sent to, `lowered` has the routines of the carrier.
 
     `inbound` has the routes by envelope field number; several routes of a case differ in their sources. `outbound` has
-    the routes by topic. `ignored` has the numbers of ignored cases, `boards` the limits of each board by name.
+    the routes by topic. `ignored` has the numbers of ignored members of the envelope's oneof, `boards` the limits of
+    each board by name.
     """
 
     table: RouteTable

@@ -65,7 +65,7 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
             listener,
         )
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
-    _open_each(counters, "unhandled", last=(*envelope.cases, UNKNOWN_CASE))
+    _open_each(counters, "unhandled", last=(*envelope.numbers, UNKNOWN_CASE))
     for metric in ENDPOINT_METRICS:
         _open_each(counters, metric, last=table.endpoints)
 

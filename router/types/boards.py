@@ -98,6 +98,14 @@ def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
     return _size_of([field for field in message.fields if field not in members], options_of)
 
 
+def member_size(field: FieldDescriptor, options_of: OptionsOf) -> int | None:
+    """Return the largest encoding of a scalar with its tag in bytes; None if it has no bound, or is ignored."""
+    options = options_of(field)
+    if options.is_ignored or why_unbounded(field, options):
+        return None
+    return _field_size(field, options, options_of)
+
+
 def framed_size(number: int, payload: int) -> int:
     """Return the size of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
     return len(varint(number << 3)) + len(varint(payload)) + payload

@@ -94,8 +94,8 @@ class _Place(NamedTuple):
 
 
 # Field numbers of google/protobuf/descriptor.proto, which make up the paths of source info.
-_FILE_MESSAGE, _FILE_ENUM = 4, 5
-_MESSAGE_FIELD, _MESSAGE_NESTED, _MESSAGE_ENUM = 2, 3, 4
+_FILE_MESSAGE, _FILE_ENUM, _FILE_EXTENSION = 4, 5, 7
+_MESSAGE_FIELD, _MESSAGE_NESTED, _MESSAGE_ENUM, _MESSAGE_EXTENSION = 2, 3, 4, 6
 _ENUM_VALUE = 2
 _TYPE_PARTS = {Part.NAME: (1,)}
 _FIELD_PARTS = {Part.NAME: (1,), Part.NUMBER: (3,), Part.TYPE: (6, 5)}
@@ -116,7 +116,9 @@ class ProtoSources:
         self._holders: dict[str, str] = {}
         for file in files:
             self._encoded[file.name] = file.SerializeToString()
-            self._holders |= dict.fromkeys((name for name, _, _ in _holders(file)), file.name)
+            names = [name for name, _, _ in holders(file)]
+            extensions = [inside(file.package, each.name) for each in file.extension]
+            self._holders |= dict.fromkeys([*names, *extensions], file.name)
 
     def file(self, name: str) -> str:
         """Return the file that declares a message or an enum, relative to the folder of the protos, with `/`."""
@@ -141,16 +143,19 @@ class _File:
         self._text = ProtoText(path)
         self._locations = {tuple(each.path): tuple(each.span) for each in file.source_code_info.location}
         self._places: dict[str, _Place] = {}
-        for name, place, declared in _holders(file):
+        for name, place, declared in holders(file):
             self._places[name] = _Place(place, _TYPE_PARTS)
             if isinstance(declared, DescriptorProto):
                 self._add(name, [each.name for each in declared.field], (*place, _MESSAGE_FIELD), _FIELD_PARTS)
+                extensions = [each.name for each in declared.extension]
+                self._add(name, extensions, (*place, _MESSAGE_EXTENSION), _FIELD_PARTS)
             else:
                 self._add(name, [each.name for each in declared.value], (*place, _ENUM_VALUE), _VALUE_PARTS)
+        self._add(file.package, [each.name for each in file.extension], (_FILE_EXTENSION,), _FIELD_PARTS)
 
     def _add(self, holder: str, names: Iterable[str], path: _Path, parts: Mapping[Part, tuple[int, ...]]) -> None:
         for index, name in enumerate(names):
-            self._places[f"{holder}.{name}"] = _Place((*path, index), parts)
+            self._places[inside(holder, name)] = _Place((*path, index), parts)
 
     def span(self, name: str, part: Part) -> SourceSpan:
         place = self._places[name]
@@ -172,7 +177,7 @@ def field_comments(files: Iterable[FileDescriptorProto]) -> dict[str, str]:
             for each in file.source_code_info.location
             if each.leading_comments or each.trailing_comments
         }
-        for name, path, declared in _holders(file):
+        for name, path, declared in holders(file):
             if isinstance(declared, DescriptorProto):
                 for index, member in enumerate(declared.field):
                     if comment := comments.get((*path, _MESSAGE_FIELD, index)):
@@ -180,10 +185,15 @@ def field_comments(files: Iterable[FileDescriptorProto]) -> dict[str, str]:
     return found
 
 
-_Holder = tuple[str, _Path, Union[DescriptorProto, EnumDescriptorProto]]
+def inside(holder: str, name: str) -> str:
+    """Return the full name of a declaration in a message, an enum or a package, which may be empty."""
+    return f"{holder}.{name}" if holder else name
 
 
-def _holders(file: FileDescriptorProto) -> Iterator[_Holder]:
+Holder = tuple[str, _Path, Union[DescriptorProto, EnumDescriptorProto]]
+
+
+def holders(file: FileDescriptorProto) -> Iterator[Holder]:
     """Yield the messages and enums of a file, nested ones included, each with its full name and path."""
     prefix = f"{file.package}." if file.package else ""
     for index, message in enumerate(file.message_type):
@@ -192,7 +202,7 @@ def _holders(file: FileDescriptorProto) -> Iterator[_Holder]:
         yield prefix + declared.name, (_FILE_ENUM, index), declared
 
 
-def _within(message: DescriptorProto, prefix: str, path: _Path) -> Iterator[_Holder]:
+def _within(message: DescriptorProto, prefix: str, path: _Path) -> Iterator[Holder]:
     name = prefix + message.name
     yield name, path, message
     for index, nested in enumerate(message.nested_type):

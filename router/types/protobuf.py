@@ -7,11 +7,16 @@ messages, a group becomes a message; extensions are omitted.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
-from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    EnumDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
@@ -19,13 +24,20 @@ from google.protobuf.message_factory import GetMessageClass
 
 from router import inputs
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, plural, shown_path
-from router.types.boards import framed_size, largest_beside, largest_encoding, longest, unbounded_fields
-from router.types.descriptors import container, enum_of, message_of
+from router.types.boards import (
+    framed_size,
+    largest_beside,
+    largest_encoding,
+    longest,
+    member_size,
+    unbounded_fields,
+)
+from router.types.descriptors import declared_type, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
 from router.types.nanopb import NO_OPTIONS, BoardOptions, NanopbOptions, OptionsFile, declares_options, read_options
 from router.types.proto_files import OPTIONS, Folder, envelope_file, proto_of, reached, read_folder
-from router.types.proto_source import Part, ProtoSources, field_comments
+from router.types.proto_source import Part, ProtoSources, field_comments, holders, inside
 from router.types.protoc import check_protos, compile_protos, findings_of, shipped
 from router.types.undecidable import undecidable
 from router.types.wire import encoding_of, validates_text
@@ -129,10 +141,20 @@ class PayloadCase:
 
 
 @dataclass(frozen=True, slots=True)
+class Unroutable:
+    """A member of the envelope's oneof that is no message; `type` as in `.proto` files."""
+
+    number: int
+    type: str
+    wire_type: int
+
+
+@dataclass(frozen=True, slots=True)
 class Envelope:
     """The message around every payload, by full name.
 
-    `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count.
+    `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. The members
+    of its oneof are the `cases`, and those that no route can take.
     """
 
     name: str
@@ -140,6 +162,17 @@ class Envelope:
     message_class: MessageClass
     cases: Mapping[str, PayloadCase]
     max_size: int
+    unroutable: Mapping[str, Unroutable] = field(default_factory=dict)
+
+    @property
+    def numbers(self) -> Mapping[str, int]:
+        """The field numbers of all members of the oneof."""
+        numbers = {name: case.number for name, case in self.cases.items()}
+        return numbers | {name: member.number for name, member in self.unroutable.items()}
+
+    def case_of(self, message: Message) -> PayloadCase | None:
+        """Return the payload case of an envelope, None if it has none."""
+        return self.cases.get(message.WhichOneof(self.oneof) or "") if self.cases else None
 
 
 def load_protos(
@@ -187,7 +220,7 @@ def _load(
         compiled = compile_protos(folder, [*names, *valid])
     files = {each.name: each for each in compiled.file}
     _note_hidden(folder, files)
-    findings = _same_name_findings(folder, compiled)
+    findings = _reserved_number_findings(folder, compiled)
     options = {}
     for name in folder.files:
         if name.endswith(OPTIONS):
@@ -277,31 +310,35 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     return ProtoSources(compiled.file, paths)
 
 
-def _same_name_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Diagnostic]:
-    """Return findings for messages of two packages with one short name: ROS and the table only use short names."""
-    names: dict[str, list[str]] = {}
-    for file in compiled.file:
-        if not inputs.is_file(folder.root / file.name):
-            continue
-        for message in file.message_type:
-            full = f"{file.package}.{message.name}" if file.package else message.name
-            names.setdefault(message.name, []).append(full)
-    findings: list[Diagnostic] = []
-    if all(len(same) == 1 for same in names.values()):
-        return findings
+def _reserved_number_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Diagnostic]:
+    """Return findings for field numbers that protoc refuses, but only in the files that its command line names."""
+    own = [file for file in compiled.file if inputs.is_file(folder.root / file.name)]
+    found = [name for file in own for name in _with_reserved_number(file)]
+    if not found:
+        return []
     sources = _sources(folder, compiled)
-    for short, (first, *others) in names.items():
-        place = sources.span(first)
-        hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
-        text = f"there are two messages '{short}'"
-        findings += [Diagnostic(sources.span(name), Code.DUPLICATE_MESSAGE, text, hint) for name in others]
-    return findings
+    message = "Field numbers 19000 through 19999 are reserved for the protocol buffer library implementation"
+    hint = "use another number"
+    return [Diagnostic(sources.span(name, Part.NUMBER), Code.BAD_PROTO, message, hint) for name in found]
+
+
+def _with_reserved_number(file: FileDescriptorProto) -> list[str]:
+    """Return the full names of fields and extensions with such a number."""
+    declared = [inside(file.package, each.name) for each in file.extension if each.number in _RESERVED_NUMBERS]
+    for holder, _, message in holders(file):
+        if isinstance(message, DescriptorProto):
+            members = (*message.field, *message.extension)
+            declared += [inside(holder, each.name) for each in members if each.number in _RESERVED_NUMBERS]
+    return declared
+
+
+_RESERVED_NUMBERS = range(FieldDescriptor.FIRST_RESERVED_FIELD_NUMBER, FieldDescriptor.LAST_RESERVED_FIELD_NUMBER + 1)
 
 
 def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     """Return the envelope of the schema, with its oneof `named`.
 
-    Raises TableError if the oneof does not exist, if a member is not a message, or if the router cannot parse a type.
+    Raises TableError if the oneof does not exist, or if the router cannot parse a type.
     """
     name = schema.envelope
     descriptor = schema.descriptor(name)
@@ -309,11 +346,11 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     if oneof is None:
         message = f"{name} has no oneof '{named.value}'"
         raise TableError.of(named.span, Code.BAD_VALUE, message, _oneof_hint(schema, named.value))
-    if scalars := [field for field in oneof.fields if field.message_type is None]:
-        raise TableError([_scalar_finding(schema, field) for field in scalars])
     if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
         raise TableError(refused)
-    cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
+    messages = [field for field in oneof.fields if field.type == FieldDescriptor.TYPE_MESSAGE]
+    others = [field for field in oneof.fields if field.type != FieldDescriptor.TYPE_MESSAGE]
+    cases = {field.name: _payload_case(schema, field) for field in messages}
     options = {field.name: schema.board_options(field) for field in oneof.fields}
     # An unbounded case is only reported if it is sent to a board.
     bounded = [
@@ -321,10 +358,15 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
         for case in cases.values()
         if case.max_size is not None and not options[case.name].is_ignored
     ]
+    sizes = (member_size(field, schema.board_options) for field in others)
+    bounded += [size for size in sizes if size is not None]
     has_room_for_all = any(each.is_apart for each in options.values())
     max_size = sum(bounded) if has_room_for_all else max(bounded, default=0)
     max_size += largest_beside(oneof, schema.board_options)
-    return Envelope(name, oneof.name, schema.message_class(name), cases, max_size)
+    unroutable = {
+        field.name: Unroutable(field.number, declared_type(field), encoding_of(field).wire_type) for field in others
+    }
+    return Envelope(name, oneof.name, schema.message_class(name), cases, max_size, unroutable)
 
 
 def _oneof_hint(schema: ProtoSchema, name: str) -> str:
@@ -340,12 +382,6 @@ def _oneof_hint(schema: ProtoSchema, name: str) -> str:
 def _oneofs(message: Descriptor) -> list[str]:
     """Return the names of the oneofs of a message, without those that stand for `optional`."""
     return [name for name, each in message.oneofs_by_name.items() if name != f"_{each.fields[0].name}"]
-
-
-def _scalar_finding(schema: ProtoSchema, field: FieldDescriptor) -> Diagnostic:
-    span = schema.span(container(field).full_name, field.name)
-    message = f"'{field.name}' is a payload case and must be a message"
-    return Diagnostic(span, Code.BAD_PROTO, message, "wrap the value in a message of its own")
 
 
 def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:

@@ -19,20 +19,21 @@ _Found = tuple[str, str, str]
 """The full name of a declaration, what is wrong with it, and what to do."""
 
 
-def undecidable(envelope: Descriptor, cases: Container[int], place: Place) -> list[Diagnostic]:
-    """Return findings about an envelope and all types in it. `cases` are the numbers of the payload cases."""
+def undecidable(envelope: Descriptor, members: Container[int], place: Place) -> list[Diagnostic]:
+    """Return findings about an envelope and all types in it. `members` are the numbers of the oneof's members."""
     types = all_types(envelope)
-    found = [*_of_envelope(envelope, cases), *(each for descriptor in types for each in _of_type(descriptor))]
+    found = [*_of_envelope(envelope, members), *(each for descriptor in types for each in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
         what = f"{envelope.full_name} contains {len(types)} message types; the limit is {MOST_TYPES}"
         found.append((envelope.full_name, what, ""))
     return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in found]
 
 
-def _of_envelope(envelope: Descriptor, cases: Container[int]) -> Iterator[_Found]:
+def _of_envelope(envelope: Descriptor, members: Container[int]) -> Iterator[_Found]:
     for field in envelope.fields:
-        if field.number in cases and field.type == FieldDescriptor.TYPE_GROUP:
-            yield field.full_name, f"the payload case {field.name} is a group", "make it a message"
+        if field.number in members and field.enum_type is not None and field.enum_type.is_closed:
+            what = f"{field.name} is in the envelope's oneof, and is a closed enum: protobuf ignores unknown numbers"
+            yield field.full_name, what, "wrap it in a message"
 
 
 def _of_type(descriptor: Descriptor) -> Iterator[_Found]:

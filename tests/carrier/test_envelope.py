@@ -39,7 +39,7 @@ def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
     made, carrier = sides
     decision = carrier.decide(data, repairs)
     assert decision == decide(made.envelope, made.inbound, data, MAX_DATAGRAM, repairs)
-    if decision.reason is None:
+    if decision.reason is None and decision.number in {case.number for case in made.envelope.cases.values()}:
         case = next(case for case in made.envelope.cases.values() if case.number == decision.number)
         payload, parse = carrier.payload(), made.envelope.message_class.FromString
         found = payload.of(carrier.whole())
@@ -81,7 +81,8 @@ def test_a_thousand_of_each_seed(sides: Mapping[str, Sides], schema: str, seed: 
         decided(sides[schema], maker.datagram(), seed % 3 != 0)
 
 
-TREE, TEXTS, SCALARS, OLD, MAPS, UNROUTED, UNROUTED_TREE = 2, 15, 16, 2047, 2048, 4, 5
+TREE, TEXTS, SCALARS, OLD, MAPS, UNROUTED, UNROUTED_TREE, NUMBER = 2, 15, 16, 2047, 2048, 4, 5, 20
+BEAT = tag(NUMBER, VARINT) + b"\1"
 
 
 def nested(depth: int) -> bytes:
@@ -154,6 +155,13 @@ MALFORMED = Decision("malformed", 0, False)
         pytest.param(framed(TREE, nested(100)) + b"\0", MALFORMED, id="too deep for a padded one"),
         pytest.param(framed(TREE, nested(99) + grouped(100)), case(TREE), id="both"),
         pytest.param(framed(TREE, b"") + framed(TEXTS, b""), case(TEXTS, superseded=1), id="the last case counts"),
+        pytest.param(framed(TREE, b"") + BEAT, case(NUMBER, superseded=1), id="the last member counts, message or not"),
+        pytest.param(BEAT + framed(TREE, b""), case(TREE, superseded=1), id="a message after a number"),
+        pytest.param(framed(TREE, b"") + BEAT + framed(TREE, b""), case(TREE, superseded=2), id="a number between"),
+        pytest.param(framed(NUMBER, b"\1"), Decision("unknown_case", NUMBER, False), id="a number as a message"),
+        pytest.param(framed(TREE, b"") + framed(NUMBER, b"\1"), case(TREE), id="a number as a message, after one"),
+        pytest.param(tag(26, GROUP) + tag(26, GROUP_END), case(26), id="a group as a member"),
+        pytest.param(framed(23, b"\xff"), MALFORMED, id="text as a member"),
         pytest.param(framed(TREE, b"\x0a\x01") + framed(TEXTS, b""), MALFORMED, id="the others have to be sound"),
         pytest.param(framed(TREE, b"\x0a\x00") + framed(TREE, b""), case(TREE), id="a payload in pieces"),
         pytest.param(framed(7, b"") + framed(TREE, b"") + framed(6, b"x"), case(TREE), id="another oneof"),
@@ -198,7 +206,7 @@ def test_a_listener_without_repairs_takes_no_zeros(sides: Mapping[str, Sides]) -
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ("oneof payload { Case case = 1 [features.message_encoding = DELIMITED]; }", "case is a group"),
+        ("oneof payload { Case case = 1; Closed lid = 2; }", "lid is in the envelope's oneof, and is a closed enum"),
         ("oneof payload { Set set = 1; }", "Set is a message set"),
     ],
 )
@@ -207,7 +215,8 @@ def test_what_it_cannot_decide_is_a_finding(tmp_path: Path, fields: str, complai
         'syntax = "proto2"; message Set { option message_set_wire_format = true; extensions 4 to max; }'
     )
     (tmp_path / "envelope.proto").write_text(
-        'edition = "2023"; import "old.proto"; message Case {} message Other { Set set = 1; }\n'
+        'edition = "2023"; import "old.proto"; message Case {} message Other { Set set = 1; } '
+        "enum Closed { option features.enum_type = CLOSED; ZERO = 0; }\n"
         f"message PBEnvelope {{ {fields} }}"
     )
     table = tmp_path / "table.yaml"

@@ -6,13 +6,13 @@ from collections.abc import Container
 from dataclasses import dataclass
 from itertools import groupby
 
+from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.types.framing import restored
 from router.types.protobuf import Envelope
 from router.types.wire import LEN
-from tests.oracles.boards import wire_fields
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
         return Decision(None, number, False) if number else Decision("malformed", 0, False)
     is_repaired = len(whole) != len(data)
     if name := parsed.WhichOneof(envelope.oneof):
-        return Decision(None, envelope.cases[name].number, is_repaired, _superseded(envelope, whole))
+        return Decision(None, envelope.numbers[name], is_repaired, _superseded(envelope, whole))
     fields = UnknownFieldSet(parsed)
     unknown = [fields[index].field_number for index in range(len(fields))]
     if not unknown:
@@ -55,8 +55,11 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
 
 
 def _superseded(envelope: Envelope, whole: bytes) -> int:
-    cases = {case.number for case in envelope.cases.values()}
-    payloads = [number for number, wire_type, _ in wire_fields(whole) if wire_type == LEN and number in cases]
+    members = {(case.number, LEN) for case in envelope.cases.values()}
+    members |= {(member.number, member.wire_type) for member in envelope.unroutable.values()}
+    fields = UnknownFieldSet(Empty.FromString(whole))
+    found = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
+    payloads = [member for member in found if member in members]
     return len(list(groupby(payloads))) - 1
 
 

@@ -133,7 +133,7 @@ static bool is_known(const struct wire_field *field, uint32_t wire_type) {
     }
 }
 
-/* Find the payload case of a well-formed envelope: the last one present. */
+/* Find the payload case of a well-formed envelope: the last member of its oneof. */
 static int find_case(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
     struct bytes rest = {data, data + envelope->size};
     uint32_t pieces = 0, unknown = 0, no_message = 0, first = 0;
@@ -145,7 +145,7 @@ static int find_case(const struct wire_schema *schema, const uint8_t *data, stru
         uint32_t number = tag >> 3, wire_type = tag & 7;
         const struct wire_field *field = find_field(&schema->types[0], number);
         bool is_case = field != NULL && (field->flags & WIRE_CASE);
-        if (is_case && wire_type == LEN) {
+        if (is_case && is_known(field, wire_type)) {
             pieces = number == envelope->case_number ? pieces + 1 : 1;
             if (pieces == 1) first = begin;
             if (pieces == 1 && envelope->case_number != 0) envelope->superseded++;
@@ -155,7 +155,7 @@ static int find_case(const struct wire_schema *schema, const uint8_t *data, stru
         } else if (!is_known(field, wire_type)) {
             if (!has_unknown) unknown = number;
             has_unknown = true;
-            if (is_case && no_message == 0) no_message = number;
+            if (is_case && field->kind == WIRE_MESSAGE && no_message == 0) no_message = number;
         }
     }
     if (envelope->case_number != 0) {

@@ -23,8 +23,8 @@ struct wire_field {
 enum wire_kind { WIRE_VARINT, WIRE_I64, WIRE_I32, WIRE_BYTES, WIRE_STRING, WIRE_MESSAGE, WIRE_GROUP };
 enum wire_flag {
     WIRE_PACKABLE = 1, /* a repeated scalar: its elements may be packed or not */
-    WIRE_CASE = 2,     /* in the envelope: a payload case, which is always a message */
-    WIRE_ROUTED = 4,   /* a payload case that has a route */
+    WIRE_CASE = 2,     /* in the envelope: a member of the oneof of payloads */
+    WIRE_ROUTED = 4,   /* a member that has a route, which is always a message */
 };
 
 struct wire_type {
