@@ -23,7 +23,7 @@ from router.log import fault, logger
 from router.net.kernel import is_listening, port_holder
 from router.observe.running import Running
 from router.recording.channels import descriptor_set
-from router.recording.mirror import Classifier, Mirrored, first_field
+from router.recording.mirror import Classifier, Mirrored, payload_number
 from router.table.addresses import Address
 from router.threads import Thread, background_threads, join_or_abandon
 from router.types.protobuf import PayloadCase
@@ -155,9 +155,11 @@ class FoxgloveServer(ServerListener):
     def _send(self, batch: Sequence[Mirrored]) -> None:
         """Send the accepted payloads of subscribed channels. Called by the mirror's thread."""
         program, classifier, channels = self._view
-        wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}
+        numbers = {name: case.number for name, case in program.envelope.cases.items()}
+        known = frozenset(numbers.values())
+        wanted = {number for name, number in numbers.items() if channels[name].has_sinks()}
         for at, listener, _, _, reason, data in batch:
-            if reason or first_field(data) not in wanted:
+            if reason or payload_number(data, known) not in wanted:
                 continue
             if (found := classifier.encoded_payload(listener, data)) is not None:
                 case, payload = found

@@ -10,13 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict
-
 from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.observe.running import Running
-from router.recording.mirror import Classifier, Mirrored, first_field
+from router.recording.mirror import Classifier, Mirrored, payload_number
 from router.threads import Thread
+from router.values import protobuf_json
 
 LOOKED_AT_SECONDS = 5.0
 """How long the mirror stays attached after a request; a page sends one every second."""
@@ -32,9 +31,8 @@ class LastValues:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._newest: dict[
-            int, tuple[int, Mirrored]
-        ] = {}  # by the number of the first field; and when (boot clock, ns)
+        self._newest: dict[int, tuple[int, Mirrored]] = {}
+        """By the number of the payload case, with the time of arrival here (boot clock, ns)."""
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
@@ -68,19 +66,19 @@ class LastValues:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Remember the newest datagrams. Called by the mirror's thread."""
-        now = boottime_ns()
+        now, numbers = boottime_ns(), self._running.program.envelope.numbers.values()
         with self._newest_lock:
             for datagram in batch:
                 *_, reason, data = datagram
                 if not reason:
-                    self._newest[first_field(data)] = now, datagram
+                    self._newest[payload_number(data, numbers)] = now, datagram
 
     def _decode(self, at: int, datagram: Mirrored, classifier: Classifier) -> None:
         _, listener, peer, endpoint, _, data = datagram
         if (found := classifier.payload(listener, data)) is None:
             return  # a reload has changed the messages meanwhile
         case, payload = found
-        fields = MessageToDict(payload, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        fields = protobuf_json(payload, complete=True)
         self._values[case.name] = {
             "at": at / 1e9,
             "source": endpoint or f"{peer[0]}:{peer[1]}",

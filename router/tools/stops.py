@@ -11,7 +11,7 @@ from router.datagrams import Wire
 from router.observe.health import REMEDIES
 from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
-from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, first_field
+from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, payload_number
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model import ANY
 from router.tools.tap import local_time, utc_text
@@ -264,7 +264,7 @@ class Stops:
                 last[route].obeyed.append(text)
 
     def _received(self, it: Recorded) -> None:
-        sender, case = it.endpoint or it.peer[0], self._names.get(first_field(it.data), "")
+        sender, case = it.endpoint or it.peer[0], self._names.get(payload_number(it.data, self._names), "")
         self._heard[sender] = it.at, it.peer[0]
         for state in self._states.values():
             if (stop := state.stop) is not None and sender in (*stop.settings.sources, *stop.settings.brakes):
@@ -295,7 +295,7 @@ class Stops:
         elif it.what == RELEASED and state.stop is not None:
             state.stop.released, state.stop = it.at, None
         elif it.what == BRAKED and state.stop is not None:
-            case = self._names.get(first_field(it.data), "")
+            case = self._names.get(payload_number(it.data, self._names), "")
             state.stop.brakes[case, it.target, ": ".join(filter(None, (it.reason, it.detail)))] += 1
 
     def _tripped(self, it: Action, state: _State) -> None:
