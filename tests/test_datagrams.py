@@ -7,6 +7,8 @@ import pytest
 from router.datagrams import Wire, framed, why_rejected, wire_of_protos
 from router.errors import DecodeError, UsageError
 from router.values import payload
+from tests.everything import unroutable, usual
+from tests.everything import wire as wire_of_everything
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,41 @@ def test_an_empty_payload_is_still_a_payload(wire: Wire) -> None:
 def test_an_unknown_case_gets_the_nearest_name(wire: Wire) -> None:
     with pytest.raises(UsageError, match=r"PBEnvelope has no payload case 'plane'; did you mean 'plain'\?"):
         wire.case("plane")
+
+
+@pytest.mark.parametrize(
+    ("case", "words", "complaint"),
+    [
+        ("old", [], "old.Old requires needed; give needed a value"),
+        (
+            "old",
+            ["motors[left].closed=CLOSED_ONE"],
+            'old.Old requires needed and motors["left"].speed; give needed and motors["left"].speed a value',
+        ),
+    ],
+)
+def test_a_missing_required_field_is_named(case: str, words: list[str], complaint: str) -> None:
+    everything = wire_of_everything()
+    with pytest.raises(UsageError) as caught:
+        everything.encode(everything.case(case), payload(everything.case(case), words))
+    assert str(caught.value) == complaint
+
+
+def test_the_envelopes_own_required_fields_stay_empty() -> None:
+    everything = wire_of_everything()
+    assert everything.encode(everything.case("empty"), payload(everything.case("empty"), [])) == b"\x3a\0"
+
+
+@pytest.mark.parametrize("name", unroutable())
+def test_a_member_that_is_no_message_is_unhandled(name: str) -> None:
+    with pytest.raises(DecodeError, match=f"^unhandled: {name} is .*, not a message$"):
+        wire_of_everything().decode(unroutable()[name])
+
+
+def test_superseded_members_are_named_whatever_they_are() -> None:
+    everything = wire_of_everything()
+    data = b"".join(unroutable().values()) + usual()["at"]
+    assert everything.decode(data).superseded == [*unroutable()]
 
 
 def test_trimmed_and_padded_datagrams_are_repaired(wire: Wire) -> None:

@@ -23,6 +23,7 @@ from router.values import (
     clock_text,
     compact,
     float_text,
+    protobuf_json,
     protobuf_tree,
     rate_text,
     ros_json,
@@ -31,6 +32,7 @@ from router.values import (
     shortened,
     words,
 )
+from tests import everything
 
 PROTOS = Path(__file__).parent / "protos"
 
@@ -128,7 +130,10 @@ def test_lists_are_appended_to_or_set_by_index_and_later_words_win(every_kind: P
         ),
         ("points.x=1", "points.x: points is a list; name an element, such as points[0].x=..."),
         ("numbers[99999]=1", "numbers[99999]: float32[] holds at most 65507 elements"),
-        ("a b=1", "'a b' is not a field path; write it as x, bbox.x or points[0]: elements count from 0"),
+        (
+            "a b=1",
+            "'a b' is not a field path; write it as x, bbox.x, points[0] or counts[key]: elements count from 0",
+        ),
     ],
 )
 def test_a_wrong_word_is_explained_in_one_line(every_kind: PayloadCase, word: str, complaint: str) -> None:
@@ -163,6 +168,82 @@ def test_what_is_shown_can_be_sent_again(every_kind: PayloadCase, values: dict[s
     again = every_kind.message_class()
     set_fields(again, every_kind.type, list(words(protobuf_tree(message, every_kind.type))))
     assert again.SerializeToString() == message.SerializeToString()
+
+
+@pytest.mark.parametrize("case", everything.wire().envelope.cases)
+def test_every_feature_of_protobuf_is_shown_so_that_it_can_be_sent_again(case: str) -> None:
+    message, kind = everything.payload(case), everything.wire().case(case).type
+    again = type(message)()
+    set_fields(again, kind, [word for word in words(protobuf_tree(message, kind)) if word != "="])
+    assert again == message
+
+
+PLAIN, OLD = (everything.wire().case(name) for name in ("plain", "old"))
+
+
+def test_a_map_is_set_by_its_keys() -> None:
+    keys = {"left": "1", "a.b": "2", 'x"]=[': "3", "": "4", "zażółć": "5"}
+    message = build(PLAIN, *(f"by_text[{json.dumps(key)}]={value}" for key, value in keys.items()), "by_text[left]=9")
+    assert dict(message.by_text) == {**keys, "left": "9"}
+    message = build(PLAIN, "by_i32[-5].speed=2", "by_i32[0x7]=", "by_flag[yes].speed=1")
+    assert {key: value.speed for key, value in message.by_i32.items()} == {-5: 2, 7: 0}
+    assert message.by_flag[True].speed == 1
+    assert compact(message, PLAIN.type) == "by_i32[-5].speed=2 by_i32[7]= by_flag[true].speed=1"
+
+
+@pytest.mark.parametrize(
+    ("case", "word", "complaint"),
+    [
+        (PLAIN, "by_text=x", "by_text is a map; name a value, such as by_text[key]=..."),
+        (PLAIN, "by_i32.speed=1", "by_i32.speed: by_i32 is a map; name a value, such as by_i32[key]"),
+        (PLAIN, "by_i32[left]=", "by_i32[left]: 'left' is not an integer (int32); write it as 42, -1 or 0x2a"),
+        (PLAIN, 'by_text["\\q"]=1', """by_text["\\q"]: "\\q" is not a key: Invalid \\escape; quote it as in JSON"""),
+        (PLAIN, "singles[left]=1", "singles[left]: 'left' is not an index; elements are numbered from 0"),
+        (OLD, "closed=0", "closed: old.Closed has no value '0'; known: CLOSED_LESS, CLOSED_ONE, CLOSED_TWO"),
+    ],
+)
+def test_a_wrong_word_for_a_map_or_a_closed_enum_is_explained(case: PayloadCase, word: str, complaint: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        build(case, word)
+    assert str(caught.value) == complaint
+
+
+def test_a_list_of_a_closed_enum_is_extended_with_its_first_value() -> None:
+    assert list(build(OLD, "some[1]=CLOSED_TWO").some) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("case", "fields", "expected"),
+    [
+        (
+            "known",
+            {"at": {"seconds": 10**12, "nanos": 5}, "lasts": {"seconds": 1}, "whole": {"value": 2**60}},
+            {"at": {"seconds": str(10**12), "nanos": 5}, "lasts": "1s", "whole": str(2**60)},
+        ),
+        ("known", {"lasts": {"seconds": 1, "nanos": -1}}, {"lasts": {"seconds": "1", "nanos": -1}}),
+        ("any", {"type_url": "t/no.Such", "value": b"\xff"}, {"type_url": "t/no.Such", "value": "/w=="}),
+        (
+            "any",
+            {"type_url": "t/plain.Motor", "value": b"\x0d\0\0\x80\x3f"},
+            {"@type": "t/plain.Motor", "speed": 1.0},
+        ),
+        (
+            "object",
+            {"fields": {"a": {"number_value": math.nan}, "b": {"bool_value": True}}},
+            {"fields": {"a": {"number_value": "NaN"}, "b": True}},
+        ),
+        ("at", {"seconds": 0}, "1970-01-01T00:00:00Z"),
+    ],
+)
+def test_only_what_has_no_json_form_is_shown_by_its_fields(case: str, fields: dict[str, Any], expected: Any) -> None:
+    assert protobuf_json(everything.payload(case, **fields)) == expected
+
+
+@pytest.mark.parametrize("datagram", everything.odd().values(), ids=everything.odd())
+def test_every_payload_has_a_json_form(datagram: bytes) -> None:
+    message = everything.wire().decode(datagram).message
+    for complete in (False, True):
+        assert json.loads(json.dumps(protobuf_json(message, complete=complete), allow_nan=False)) is not ...
 
 
 def test_defaults_are_left_out(every_kind: PayloadCase) -> None:

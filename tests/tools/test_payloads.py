@@ -4,10 +4,12 @@ import math
 from typing import Any
 
 import pytest
+from google.protobuf.json_format import MessageToDict
 
 from router.datagrams import Wire, wire_of_protos
 from router.tools.payloads import PayloadModel, pose
 from router.types.protobuf import PayloadCase
+from tests import everything
 from tests.tables import PROTOS
 
 EPOCH = 1_700_000_000.0
@@ -52,6 +54,14 @@ def test_every_field_of_a_case_without_a_model_is_filled(every_kind: PayloadCase
     assert len(first.numbers) == 3
     assert first.HasField("point")
     assert first.mode in (0, 1, -2)
+
+
+def test_well_known_types_have_values_with_a_json_form() -> None:
+    for case in everything.wire().envelope.cases.values():
+        for message in sequence(case, seed=1, times=(0.0, 1.25, 59.9999999999)):
+            MessageToDict(message)
+    at = sequence(everything.wire().case("known"), seed=1, times=(1.25,))[0]
+    assert (at.at.ToNanoseconds(), at.lasts.ToNanoseconds()) == (1_700_000_001_250_000_000, 1_250_000_000)
 
 
 def test_payloads_fit_the_envelope_that_boards_take(rover: Wire) -> None:
