@@ -449,8 +449,9 @@ def ros_peers(program: Program) -> Iterator[CheckResult]:
     for router in sorted({each.router for each in found.shared}):
         theirs = sorted(each for each in found.shared if each.router == router)
         topics = [each.name for each in theirs if not each.is_node]
-        whats = ["has the name of its node"] * any(each.is_node for each in theirs)
-        whats += [f"takes messages from {listed(topics)}"] * bool(topics)
+        whats = ["has the name of its node"] if any(each.is_node for each in theirs) else []
+        if topics:
+            whats.append(f"takes messages from {listed(topics)}")
         what = f"{which} router runs, process {router.process} on {router.host}: it {listed(whats)}"
         yield warning("ROS", what, remedy)
     if found.namesakes:
