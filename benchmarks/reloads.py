@@ -146,7 +146,7 @@ class RunningRouter:
     def __init__(self, process: subprocess.Popen[str], path: Path) -> None:
         table = read(path)
         self._pid = process.pid
-        self._url = f"http://{table.http.value if table.http else ''}"
+        self._url = f"http://{table.http.address.value if table.http else ''}"
         self.host, self.port = table.listeners["rover"].address.value
 
     def reload(self) -> None:

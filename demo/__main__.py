@@ -86,7 +86,7 @@ def main() -> int:
     except RouterError as error:
         console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
         return 1
-    pages = {"status page": table.http.value if table.http else None, "ROS topics": page_of(table)}
+    pages = {"status page": table.http.address.value if table.http else None, "ROS topics": page_of(table)}
     return tell(console, findings, pages)
 
 

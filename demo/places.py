@@ -28,7 +28,7 @@ def taken_places(table: RouteTable) -> list[str]:
             open_udp(address, purpose).close()
         except UsageError as error:
             problems.append(str(error))
-    listening = {"http": table.http} if table.http is not None else {}
+    listening = {"http": table.http.address} if table.http is not None else {}
     for name, gateway in table.gateways.items():
         if gateway.transport.value is not Transport.UDP and gateway.address is not None:
             listening[f"gateway {name}"] = gateway.address

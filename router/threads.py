@@ -27,6 +27,9 @@ START_S = 2.0
 REST_S = 0.1
 """Seconds before a thread retries after a shortage."""
 
+ACCEPTED_AFTER_CLOSING = "Invalid file descriptor: -1"
+"""The text of asyncio's ValueError when it retries `accept`, a second after descriptors ran out, on a closed socket."""
+
 
 class Thread(threading.Thread):
     """A daemon thread. `target` is called again after a shortage (`is_shortage`)."""

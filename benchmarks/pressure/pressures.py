@@ -20,6 +20,8 @@ from benchmarks.versus import helpers
 from benchmarks.versus.helpers import Helper
 from benchmarks.versus.processes import read
 from benchmarks.versus.subject import Subject
+from router.errors import RouterError
+from router.tools.running_router import post
 
 CLIENTS = 100
 FEWEST_CLIENTS = 4
@@ -176,11 +178,10 @@ def _listening(pressed: Pressed) -> int:
 @contextmanager
 def recording(pressed: Pressed) -> Iterator[Judge]:
     place = pressed.place
-    request = urllib.request.Request(f"http://127.0.0.1:{place.metrics}/record/save", method="POST")
+    url = f"http://127.0.0.1:{place.metrics}"
 
     def save() -> int:
-        with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310 - our own address
-            return len(answer.read())
+        return len(post(url, "/record/save", 30).body)
 
     with _repeated(SAVE_SECONDS, save) as saved:
 
@@ -270,7 +271,7 @@ def _repeated(period: float, act: Callable[[], int]) -> Iterator[list[int]]:
         while not ended.wait(period):
             try:
                 results.append(act())
-            except OSError as error:
+            except (OSError, RouterError) as error:
                 print(f"  {error}", file=sys.stderr)
 
     thread = threading.Thread(target=run)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 _MAPS = Path("/proc/self/maps")
 
-_IDLE = ("_protoc_compiler.", "_foxglove_py.")
-"""Prefixes of libraries that are used only at reloads or once a client connects: 14 MB together."""
+_IDLE = ("_protoc_compiler.",)
+"""Prefixes of libraries that are used only at reloads."""
 
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -24,6 +25,7 @@ from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.kept.head_start import HeadStart
 from router.log import logger
+from router.net.doors import Door
 from router.net.udp import Listener
 from router.observe.obedience import Obedience, Replies
 from router.observe.reports import Reporter
@@ -80,7 +82,7 @@ class Router:
         self._runtime = Runtime(plane, self._reporter, ros_args)
         if head_start is not None:
             self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
-        self._services = Services(self)
+        self._services = Services(self, self._runtime.refused)
         self._keeper = keeper
         self._reloader = Reloader(self._runtime, environ, self._replaced, keeper)
         self._watcher: Watcher | None = None
@@ -244,6 +246,7 @@ class Router:
 
         return {
             **self._services.computed_series(),
+            "connections_refused": lambda: [((server,), n) for server, n in list(self._runtime.refused.items())],
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
@@ -274,9 +277,10 @@ class Router:
 class Services:
     """The services of the table besides routing: recorder, Foxglove, diagnostics, HTTP."""
 
-    def __init__(self, running: Running) -> None:
+    def __init__(self, running: Running, refused: Counter[str]) -> None:
         self.http_address: Address | None = None
         self._running = running
+        self._refused = refused
         self._recorder: Recorder | None = None
         self._saving = DaemonThread("saving")
 
@@ -295,7 +299,8 @@ class Services:
         if table.foxglove is not None:
             from router.observe.foxglove import FoxgloveServer
 
-            opening.callback(FoxgloveServer(table.foxglove, running).close)
+            door = Door("foxglove", table.foxglove.networks, self._refused)
+            opening.callback(FoxgloveServer(table.foxglove, door, running).close)
         if diagnostics is None and table.http is None:
             return
         from router.observe.watch import Health
@@ -310,7 +315,9 @@ class Services:
             from router.observe.http import HttpServer
 
             save = self._recorder.save if self._recorder and table.record and table.record.last else None
-            server = HttpServer(table.http.value, table.http.span, running, health, save)
+            door = Door("http", table.http.networks, self._refused)
+            address = table.http.address
+            server = HttpServer(address.value, address.span, door, running, health, save)
             opening.callback(server.close)
             self.http_address = server.address
 

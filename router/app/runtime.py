@@ -7,6 +7,7 @@ between two messages), finish (close what is no longer used). The first program 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -59,6 +60,7 @@ class Runtime:
         self.drops = KernelDrops()
         self.sockets = Sockets(self.drops, plane.library)
         self.gateways: GatewayThread | None = None
+        self.refused: Counter[str] = Counter()
         self._counts = plane.counts
         self._reporter = reporter
         self._ros_args = ros_args
@@ -252,7 +254,9 @@ class Runtime:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
             reporter, counts = self._reporter, self._counts.gateways
-            self.gateways = GatewayThread(self._ros, self.plane.library, counts, reporter.report, reporter.failed)
+            self.gateways = GatewayThread(
+                self._ros, self.plane.library, counts, reporter.report, reporter.failed, self.refused
+            )
             undo.callback(self._stop_gateways)
         feed = {name: deadman.feed for name, deadman in built.client_deadmen.items()}
         change = self.gateways.prepare(built.program, feed)

@@ -179,7 +179,7 @@ def _places(router: Router, reachable: Callable[[Address], Address]) -> Iterator
     for name, gateway in table.gateways.items():
         yield f"gateway {name}", _place(gateway, reachable)
     if table.foxglove is not None:
-        yield "Foxglove", f"ws://{reachable(table.foxglove.value)}"
+        yield "Foxglove", f"ws://{reachable(table.foxglove.address.value)}"
 
 
 def _place(gateway: Gateway, reachable: Callable[[Address], Address]) -> str:

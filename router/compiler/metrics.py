@@ -161,6 +161,12 @@ METRICS = (
         ("route", "reason"),
         "Messages not delivered to single clients, by reason.",
     ),
+    Metric(
+        "connections_refused",
+        "counter",
+        ("server",),
+        "Connections from addresses outside the server's `from`: http, foxglove, or a gateway.",
+    ),
     Metric("mirror_dropped", "counter", (), "Datagrams and actions that recordings and taps missed."),
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
     Metric("recorded_bytes", "counter", (), "Bytes of the datagrams written to a recording."),

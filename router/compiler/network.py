@@ -54,9 +54,9 @@ def _local_addresses(table: RouteTable) -> Iterator[_LocalAddress]:
         interface = listener.interface
         yield _LocalAddress(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
     if table.http is not None:
-        yield _LocalAddress("'http'", table.http)
+        yield _LocalAddress("'http'", table.http.address)
     if table.foxglove is not None:
-        yield _LocalAddress("'foxglove'", table.foxglove)
+        yield _LocalAddress("'foxglove'", table.foxglove.address)
     for gateway in table.gateways.values():
         owner = f"gateway '{gateway.name}'"
         if gateway.receive is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
@@ -29,11 +30,12 @@ from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.udp import UdpTransport
 from router.gateway.transport.websocket import WebsocketTransport
 from router.log import logger
+from router.net.doors import Door
 from router.table.addresses import Address
 from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
-from router.threads import DaemonThread, StuckError, Thread, join_or_abandon
+from router.threads import ACCEPTED_AFTER_CLOSING, DaemonThread, StuckError, Thread, join_or_abandon
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -47,9 +49,6 @@ MOST_REQUEST = 4096
 _PATIENCE_S = 5.0
 """Seconds that a change of gateways may take in the event loop; opening a Zenoh session takes some."""
 _PATIENCE_OF_STOP_S = 2.5
-
-_CLOSED = "Invalid file descriptor: -1"
-"""Raised by asyncio when it retries `accept`, a second after descriptors ran out, and the socket has been closed."""
 
 PAGE = Path(__file__).with_name("page.html")
 
@@ -69,7 +68,7 @@ class GatewayThread:
     `prepare` opens new gateways, `retire` closes obsolete ones, `finish` starts the new services; `abandon` undoes the
     change instead. `library` is the carrier's. `counts` belong to this thread, which calls all callbacks.
     `kernel_drops` has, for each gateway that receives datagrams, a thread-safe function that returns how many the
-    kernel has dropped.
+    kernel has dropped. `refused` counts refused connections (see Door).
     """
 
     def __init__(
@@ -79,9 +78,11 @@ class GatewayThread:
         counts: list[int],
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
+        refused: Counter[str],
     ) -> None:
         self.kernel_drops: dict[str, Callable[[], int]] = {}
         self._failed = failed
+        self._refused = refused
         self._counts = counts
         self._ros = ros
         self._library = library
@@ -171,7 +172,7 @@ class GatewayThread:
 
     async def _open(self, plan: GatewayPlan, program: Program, outputs: InboundOutputs) -> GatewayService:
         settings, counters = plan.settings, program.counters
-        http = program.table.http.value if program.table.http else None  # fixed while the router runs
+        http = program.table.http.address.value if program.table.http else None  # fixed while the router runs
         gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, boottime_ns)
         inbound = InboundPublisher(plan, ENCODINGS[settings.format](settings), counters, self._counts, outputs)
         service = GatewayService(
@@ -184,7 +185,8 @@ class GatewayThread:
         return service
 
     def _transport(self, settings: Gateway, http: Address | None, events: Events) -> Transport:
-        transport = _new_transport(settings, http, events)
+        door = Door(f"gateways.{settings.name}", settings.networks, self._refused)
+        transport = _new_transport(settings, http, events, door)
         if isinstance(transport, UdpTransport) and settings.receive is not None:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
@@ -219,7 +221,7 @@ class GatewayThread:
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Report an exception of a callback of the loop: a fault of the router."""
         error = context.get("exception")
-        if isinstance(error, ValueError) and str(error) == _CLOSED:
+        if isinstance(error, ValueError) and str(error) == ACCEPTED_AFTER_CLOSING:
             return
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
 
@@ -231,7 +233,7 @@ async def _close(services: Iterable[GatewayService]) -> None:
             closing.push_async_callback(service.close)
 
 
-def _new_transport(settings: Gateway, http: Address | None, events: Events) -> Transport:
+def _new_transport(settings: Gateway, http: Address | None, events: Events, door: Door) -> Transport:
     """Return the transport for a gateway's settings, not open yet. `http` has the status page."""
     most = settings.max_inbound if settings.inbound else MOST_REQUEST
     if settings.zenoh is not None:
@@ -244,9 +246,9 @@ def _new_transport(settings: Gateway, http: Address | None, events: Events) -> T
         return UdpTransport(address, settings.receive.value if settings.receive else None, events)
     limits = Limits(settings.max_clients, settings.max_clients_per_host, most)
     if settings.transport.value is TransportKind.TCP:
-        return TcpTransport(address, events, limits, prefixed=settings.format is GatewayFormat.GATEWAY_V1)
+        return TcpTransport(address, events, limits, door, prefixed=settings.format is GatewayFormat.GATEWAY_V1)
     text = settings.format is GatewayFormat.JSON
-    return WebsocketTransport(address, events, limits, text=text, page=_page(settings.name, http))
+    return WebsocketTransport(address, events, limits, door, text=text, page=_page(settings.name, http))
 
 
 def _page(name: str, http: Address | None) -> bytes:

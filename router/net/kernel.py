@@ -227,11 +227,6 @@ def port_holder(protocol: str, port: int) -> str:
     return _described(_process(protocol, port))
 
 
-def is_listening(port: int) -> bool:
-    """Return whether a TCP socket of this computer listens on a port."""
-    return any(True for _ in _inodes("tcp", port))
-
-
 def _described(process: Path | None) -> str:
     return f"{_name(process)} (pid {process.name})" if process is not None else "another process"
 

@@ -37,6 +37,9 @@ SAVE_SECONDS = 10.0
 
 SAVE = "/record/save"
 
+PAGES = frozenset({"/", "/status.json", "/recent.json", "/map.json"})
+"""The status page and what it loads: for browsers that opened it at a local address."""
+
 GZIP_FROM = 1000
 """Minimum bytes of a compressed response."""
 
@@ -122,7 +125,7 @@ class Responder:
             return self._get[path](query)
         if path in self._post:
             return plain(HTTPStatus.METHOD_NOT_ALLOWED, f"{path} requires POST")
-        return plain(HTTPStatus.NOT_FOUND, "not found; there are /, /metrics, /healthz, /ready and /tap")
+        return plain(HTTPStatus.NOT_FOUND, "not found; there are /, /metrics, /healthz and /ready")
 
     def metrics(self, accepts: str) -> Response:
         """Return the metrics in one of two formats: with more, clients could defeat the cache."""

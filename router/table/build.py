@@ -18,7 +18,7 @@ from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
 from router.lean import left_out
-from router.table.addresses import LOCAL, REMOTE, Address, parse_local
+from router.table.addresses import LOCAL, REMOTE, Address
 from router.table.keys import Key, keys_of
 from router.table.model import (
     ROS,
@@ -43,6 +43,7 @@ from router.table.model import (
     RecordSettings,
     Route,
     RouteTable,
+    ServerSettings,
     Topic,
     TopicPattern,
     TopicRate,
@@ -122,7 +123,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         envelope=envelope,
         node=builder.one(root, "node", _node) or NodeSettings(),
         package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
-        http=builder.one(root, "http", _address),
+        http=builder.one(root, "http", _server),
         listeners=builder.each(root, "listen", _named(Listener)),
         endpoints=builder.each(root, "endpoints", _named(Endpoint)),
         routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
@@ -131,7 +132,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
         broken=frozenset(builder.broken),
         record=builder.one(root, "record", _record),
-        foxglove=builder.one(root, "foxglove", _address),
+        foxglove=builder.one(root, "foxglove", _server),
         reload_on_change=builder.one(root, "reload", _reload) or False,
         networks=builder.one(root, "networks", _networks),
     )
@@ -269,9 +270,8 @@ def _node(entry: Entry) -> NodeSettings:
     return structure(NodeSettings, settings, span=entry.key.span, diagnostics=diagnostics)
 
 
-def _address(entry: Entry) -> Located[Address]:
-    written = located(mapping(entry.value).get("address"))
-    return Located(parsed(parse_local, written), written.span)
+def _server(entry: Entry) -> ServerSettings:
+    return structure(ServerSettings, mapping(entry.value), span=entry.key.span)
 
 
 def _name(entry: Entry) -> Located[str]:
@@ -556,6 +556,7 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     Destination: _destination,
     Expression: _expression,
     FieldMap: _fields,
+    IPv4Network: lambda node, _: _network(node),
     Inbound: _inbound,
     Obeyed: _obeyed,
     Topic: _topic,

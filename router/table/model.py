@@ -103,6 +103,15 @@ class NodeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ServerSettings:
+    """A server of the router, for clients from `networks` or from anywhere. `span` is its key in the table."""
+
+    span: SourceSpan
+    address: Annotated[Located[Address], LOCAL]
+    networks: Annotated[tuple[IPv4Network, ...], Named("from")] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Listener:
     """A listener; `span` is its name in the table. `receive_buffer` is in bytes.
 
@@ -515,7 +524,8 @@ class Gateway:
 
     `address` is the clients' address (udp) or the one to listen on (tcp, websocket); None for Zenoh. `receive` is the
     local address of a udp gateway. Periods are in ns, sizes in bytes. `compression` is a zstd level, 0 for none. The
-    first of `rates` that matches a topic applies, else `publish_period`.
+    first of `rates` that matches a topic applies, else `publish_period`. Clients connect from `networks`, or from
+    anywhere.
     """
 
     name: str
@@ -536,6 +546,7 @@ class Gateway:
     max_message: Annotated[int | None, MESSAGE_SIZE] = None
     max_clients: int = 1024
     max_clients_per_host: int = 16
+    networks: Annotated[tuple[IPv4Network, ...], Named("from")] = ()
     inbound: tuple[Inbound, ...] = ()
 
     @property
@@ -572,7 +583,7 @@ class RouteTable:
     sha256: str
     envelope: EnvelopeSettings | None
     node: NodeSettings
-    http: Located[Address] | None
+    http: ServerSettings | None
     listeners: Mapping[str, Listener]
     endpoints: Mapping[str, Endpoint]
     routes: tuple[Route, ...]
@@ -581,7 +592,7 @@ class RouteTable:
     ignored_gateways: Mapping[str, IgnoredGateway] = field(default_factory=dict)
     broken: frozenset[str] = frozenset()
     record: RecordSettings | None = None
-    foxglove: Located[Address] | None = None
+    foxglove: ServerSettings | None = None
     reload_on_change: bool = False
     networks: Networks | None = None
     package: Located[str] | None = None

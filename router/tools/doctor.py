@@ -109,7 +109,7 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
             "add `http: {address: 127.0.0.1:9108}`",
         )
     elif running is None:
-        what = f"no router answers at {program.table.http.value}: its health was not checked"
+        what = f"no router answers at {program.table.http.address.value}: its health was not checked"
         yield fine("router", what)
     else:
         yield from _reported(program, running)

@@ -258,7 +258,8 @@ def _absence(listener: Listener) -> tuple[str, str] | None:
 
 
 def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
-    return (program.table.http, "http.address"), (program.table.foxglove, "foxglove.address")
+    servers = ("http", program.table.http), ("foxglove", program.table.foxglove)
+    return tuple((server.address if server else None, f"{key}.address") for key, server in servers)
 
 
 def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:

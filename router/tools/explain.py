@@ -308,6 +308,7 @@ def _transport(gateway: Gateway) -> str:
     assert gateway.address is not None  # noqa: S101 - only Zenoh has none
     if gateway.transport.value is not Transport.UDP:
         most = f"{gateway.max_clients} clients at most, {gateway.max_clients_per_host} from one host"
+        most += f", only from {', '.join(map(str, gateway.networks))}" if gateway.networks else ""
         return f"{gateway.transport.value.value} on {gateway.address.value}, {most}"
     heard = f"on {gateway.receive.value}" if gateway.receive else "from any port"
     return f"udp to {gateway.address.value} {heard}"
@@ -465,8 +466,8 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
         "node": {"name": table.node.name, "namespace": table.node.namespace},
         "node.diagnostics": table.node.diagnostics is not None,
         "reload.on_change": table.reload_on_change,
-        "http.address": table.http,
-        "foxglove.address": table.foxglove,
+        "http": table.http,
+        "foxglove": table.foxglove,
         "record": table.record,
     }
     parts = {"table": _settings_lines(settings)}

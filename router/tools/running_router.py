@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import re
+import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -52,7 +54,7 @@ def url_of(table: RouteTable) -> str:
     """Return the URL of the router that runs a table. Raises UsageError if the table has no `http.address`."""
     if table.http is None:
         raise UsageError(f"{table.path} has no 'http.address', so a running router cannot be reached")
-    return url_at(table.http.value)
+    return url_at(table.http.address.value)
 
 
 def url_at(address: Address) -> str:
@@ -63,8 +65,8 @@ def url_at(address: Address) -> str:
 
 
 def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
-    """Send a command to a running router. Raises TransportError if no router answers."""
-    with closing(_connection(url, patience)) as connection:
+    """Send a command to a running router of this computer. Raises UsageError or TransportError if none executes it."""
+    with closing(_control(url, patience)) as connection:
         response = _asked(connection, url, "POST", path)
         text = _read(response, url)
         try:
@@ -122,7 +124,7 @@ def tap(
     """
     parameters = [("case", case) for case in cases] + [("from", source) for source in sources]
     words = urlencode(parameters + ([("only", only)] if only else []))
-    with closing(_connection(url, PATIENCE)) as connection:
+    with closing(_control(url, PATIENCE)) as connection:
         response = _asked(connection, url, "GET", f"/tap?{words}" if words else "/tap")
         if response.status != http.client.OK:
             raise UsageError(_first_line(_read(response, url)))
@@ -155,11 +157,28 @@ def _connection(url: str, patience: float) -> http.client.HTTPConnection:
     return http.client.HTTPConnection(host, port or 80, timeout=patience)
 
 
+class _ControlConnection(http.client.HTTPConnection):
+    """A connection to the control socket of the router that serves HTTP at this host and port."""
+
+    def connect(self) -> None:
+        from router.net import control
+
+        self.sock = control.connect(socket.gethostbyname(self.host), self.port, self.timeout)
+
+
+def _control(url: str, patience: float) -> http.client.HTTPConnection:
+    over_tcp = _connection(url, patience)
+    return _ControlConnection(over_tcp.host, over_tcp.port, timeout=patience)
+
+
 def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: str) -> http.client.HTTPResponse:
     try:
         connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRNOTAVAIL:
+            what = f"{url} is another computer: a router is controlled on its own computer only"
+            raise UsageError(what, "log in there") from error
         remedy = "start it, or name another router with -t TABLE or --url"
         why = getattr(error, "strerror", None) or error  # without the number that OSError shows
         raise TransportError(f"{Problem(Kind.ROUTER_DOWN, {'instance': url}).words}: {why}", remedy) from error

@@ -9,6 +9,7 @@ import urllib.request
 from functools import partial
 from pathlib import Path
 
+from router.tools.running_router import post
 from tests.acceptance.gateway_clients import lines, repeating
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
@@ -35,8 +36,8 @@ routes:
 IMU = sample("imu_info", WIRE.envelope.cases["imu_info"].message_class(accel_x=1.5)).datagram
 
 
-def asked(port: int, path: str, data: bytes | None = None) -> str:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", data, PATIENCE) as answer:
+def asked(port: int, path: str) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=PATIENCE) as answer:
         return str(answer.read().decode())
 
 
@@ -64,18 +65,18 @@ def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: 
             assert total(place.scrape(), "datagrams_received") == total(place.scrape(), "unhandled") == 0
 
             table.write_text(only + routes)
-            assert json.loads(asked(place.metrics, "/-/reload", b""))["ok"]
+            assert post(f"http://127.0.0.1:{place.metrics}", "/-/reload").ok
             with repeating(partial(board.sendto, IMU, ("127.0.0.5", place.listen))):
                 imu = next(line for line in received if line["topic"] == "/gw/imu")
             assert imu["data"]["accel_x"] == 1.5
             assert "imu_info" in json.loads(asked(place.metrics, "/status.json"))["routes"]
 
             table.write_text(only)
-            assert json.loads(asked(place.metrics, "/-/reload", b""))["ok"]
+            assert post(f"http://127.0.0.1:{place.metrics}", "/-/reload").ok
             assert asked(place.metrics, "/ready").strip() == "ready"
             with udp("127.0.0.5", place.listen):
                 pass  # nobody has it any more
-            saved = Path(json.loads(asked(place.metrics, "/record/save", b""))["file"])
+            saved = Path(post(f"http://127.0.0.1:{place.metrics}", "/record/save").body["file"])
             assert saved.stat().st_size > 0
             peer.say("/gw/word", {"data": "after"})
             assert next(line for line in received if line["topic"] == "/gw/word")["data"] == {"data": "after"}

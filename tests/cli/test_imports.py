@@ -34,7 +34,6 @@ HEAVY = COMPILING | {
     "jsonschema",
     "asyncio",
     "argcomplete",
-    "foxglove",
     "importlib.metadata",
     "mcap",
     "msgspec",
@@ -86,11 +85,11 @@ def test_status_reads_an_address_and_asks_there(tmp_path: Path) -> None:
     assert found.packages == {"observe", "table", "tools"}
 
 
-@pytest.mark.parametrize("verb", ["status", "reload"])
-def test_what_is_at_a_url_needs_no_table(verb: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("verb", "control"), [("status", set()), ("reload", {"net"})])
+def test_what_is_at_a_url_needs_no_table(verb: str, control: set[str], tmp_path: Path) -> None:
     found = imported(tmp_path, verb, "--url", "http://127.0.0.1:9")
     assert found.heavy == set()
-    assert found.packages == {"observe", "tools"}
+    assert found.packages == {"observe", "tools"} | control
 
 
 @pytest.mark.parametrize("arguments", ["validate", "validate routes/ --strict", "test routes/", "explain imu_info"])

@@ -56,8 +56,8 @@ def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
     assert table is not None
     assert table.http is not None
     host, _, port = SCRAPED.rpartition(":")
-    assert table.http.value.host in (host, "0.0.0.0")
-    assert table.http.value.port == int(port)
+    assert table.http.address.value.host in (host, "0.0.0.0")
+    assert table.http.address.value.port == int(port)
     assert f"ROUTER_METRICS={SCRAPED}\n" in DOCKERFILE
     [command] = re.findall(r"^ +CMD (\[.+\])$", DOCKERFILE, re.MULTILINE)
     interpreter, option, code = yaml.safe_load(command)

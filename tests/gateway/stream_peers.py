@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
 from router.gateway.transport.stream import Limits, StreamTransport
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.websocket import WebsocketTransport
+from router.net.doors import Door
 from router.table.addresses import Address
 from tests.gateway.transport_events import Events, opened
 
@@ -26,17 +28,23 @@ CLOSE = 8
 """The opcode of a WebSocket's close frame."""
 
 
-def transport_of(kind: str, events: Events, limits: Limits = TEN, address: Address = ANY) -> StreamTransport:
+OPEN = Door("gateways.test", (), Counter())
+"""Admits everybody."""
+
+
+def transport_of(
+    kind: str, events: Events, limits: Limits = TEN, address: Address = ANY, door: Door = OPEN
+) -> StreamTransport:
     if kind == "websocket":
-        return WebsocketTransport(address, events, limits, text=False, page=b"")
-    return TcpTransport(address, events, limits, prefixed=kind == "packets")
+        return WebsocketTransport(address, events, limits, door, text=False, page=b"")
+    return TcpTransport(address, events, limits, door, prefixed=kind == "packets")
 
 
 @asynccontextmanager
-async def served(kind: str, limits: Limits = TEN) -> AsyncIterator[tuple[StreamTransport, Events]]:
+async def served(kind: str, limits: Limits = TEN, door: Door = OPEN) -> AsyncIterator[tuple[StreamTransport, Events]]:
     """An open transport and its events."""
     events = Events()
-    transport = transport_of(kind, events, limits)
+    transport = transport_of(kind, events, limits, door=door)
     async with opened(transport):
         yield transport, events
 

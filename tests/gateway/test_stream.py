@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from contextlib import ExitStack
+from collections import Counter
+from contextlib import ExitStack, suppress
+from ipaddress import IPv4Network
 
 import pytest
 from structlog.testing import capture_logs
@@ -16,8 +18,10 @@ from router.gateway.transport import tcp as gateway_tcp
 from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
 from router.gateway.transport.stream import MESSAGE_SECONDS, Limits, StreamTransport
+from router.net import doors
+from router.net.doors import Door
 from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
-from tests.gateway.stream_peers import KINDS, MOST, framed, join, served, transport_of, websocket_frame
+from tests.gateway.stream_peers import GREETING, KINDS, MOST, framed, join, served, transport_of, websocket_frame
 from tests.gateway.transport_events import Events, data, opened, resident_kib
 
 EACH_KIND = pytest.mark.parametrize("kind", KINDS)
@@ -316,3 +320,27 @@ async def test_closing_ends_although_clients_are_just_coming(kind: str, turns: i
         for _ in range(turns):
             await asyncio.sleep(0)
         await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
+
+
+@EACH_KIND
+@asynchronous
+async def test_clients_outside_the_networks_are_refused_and_counted(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "is_own_computer", lambda *_: False)
+    refused = Counter[str]()
+    door = Door("gateways.test", [IPv4Network("127.0.1.0/24"), IPv4Network("127.0.3.7/32")], refused)
+    with capture_logs() as logs:
+        async with served(kind, door=door) as (transport, events):
+            assert transport.address is not None
+            for host in ("127.0.2.1", "127.0.2.1", "127.0.3.8"):
+                reader, writer = await asyncio.open_connection(*transport.address, local_addr=(host, 0))
+                with suppress(ConnectionError):
+                    assert await reader.read() == b""
+                writer.close()
+            assert refused == {"gateways.test": 3}
+            assert not events.clients
+            _, writer = await asyncio.open_connection(*transport.address, local_addr=("127.0.3.7", 0))
+            writer.write(GREETING)
+            await until(lambda: len(events.clients) == 1)
+            writer.close()
+    assert [each["client"] for each in logs] == ["127.0.2.1", "127.0.3.8", "127.0.2.1"]  # the last line is a summary
+    assert logs[-1]["more"] == 1

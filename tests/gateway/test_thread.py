@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,7 +24,7 @@ from tests.ports import free_port
 
 def opened(made: Program) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
-    thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print)
+    thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter())
     try:
         thread.finish(thread.prepare(made, {}))
     except BaseException:

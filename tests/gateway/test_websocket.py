@@ -19,7 +19,7 @@ from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.stream import Limits
 from router.gateway.transport.websocket import WebsocketTransport
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.stream_peers import ANY, MOST, join
+from tests.gateway.stream_peers import ANY, MOST, OPEN, join
 from tests.gateway.transport_events import Events, data, opened
 
 PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script><script>let b;</script>"
@@ -29,7 +29,7 @@ PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script>
 async def served(max_clients: int, *, text: bool) -> AsyncIterator[tuple[WebsocketTransport, Events]]:
     """An open transport, and what it tells."""
     events = Events()
-    transport = WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), text=text, page=PAGE)
+    transport = WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), OPEN, text=text, page=PAGE)
     async with opened(transport):
         yield transport, events
 

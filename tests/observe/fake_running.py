@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import cast
 
@@ -17,6 +18,7 @@ from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import SourceSpan
+from router.net.doors import Door
 from router.observe.health import Look
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
@@ -154,5 +156,7 @@ def served(
     save: Callable[[str], Path] | None = None,
     address: Address = LOOPBACK,
     health: FakeHealth | None = None,
+    networks: Sequence[IPv4Network] = (),
 ) -> HttpServer:
-    return HttpServer(address, SPAN, running, cast("Health", health or FakeHealth(running)), save)
+    door = Door("http", networks, Counter())
+    return HttpServer(address, SPAN, door, running, cast("Health", health or FakeHealth(running)), save)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import shutil
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
+from ipaddress import IPv4Network
+from itertools import repeat
 from pathlib import Path
 from time import monotonic, time_ns
 from typing import cast
@@ -14,23 +17,30 @@ from typing import cast
 import pytest
 from google.protobuf.message import Message
 from structlog.testing import capture_logs
-from websockets.exceptions import InvalidStatus
+from websockets.client import ClientProtocol
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+from websockets.uri import parse_uri
 
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.errors import Located, SourceSpan, StartError
+from router.net import doors
+from router.net.doors import Door
 from router.observe import foxglove
 from router.observe.foxglove import FoxgloveServer
 from router.observe.running import Running
 from router.recording.mirror import Consumer, MirroredDatagram
 from router.table.addresses import Address
-from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
+from router.table.model import ServerSettings
+from tests.observe.foxglove_client import PATIENCE, SUBPROTOCOL, FoxgloveClient
 from tests.tables import PROTOS, ROUTES
 
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
-LOOPBACK = Located(Address("127.0.0.1", 0), SPAN)
+LOOPBACK = Address("127.0.0.1", 0)
 PEER = ("192.168.0.30", 8)
+REFUSED = Counter[str]()
 
 
 class Showing:
@@ -67,6 +77,11 @@ class Showing:
             consumer(batch)
 
 
+def serve(router: Showing, address: Address = LOOPBACK, networks: Sequence[IPv4Network] = ()) -> FoxgloveServer:
+    settings = ServerSettings(SPAN, Located(address, SPAN))
+    return FoxgloveServer(settings, Door("foxglove", networks, REFUSED), cast("Running", router))
+
+
 def compiled(table: Path) -> Program:
     checked = check_table(table)
     assert checked.program is not None, [*map(str, checked.diagnostics)]
@@ -85,7 +100,7 @@ def router(program: Program) -> Showing:
 
 @pytest.fixture
 def server(router: Showing) -> Iterator[FoxgloveServer]:
-    with closing(FoxgloveServer(LOOPBACK, cast("Running", router))) as opened:
+    with closing(serve(router)) as opened:
         yield opened
 
 
@@ -183,7 +198,7 @@ def test_listener_that_repairs_nothing_shows_nothing_that_it_rejects(tmp_path: P
     router = Showing(compiled(table))
     brake = envelope(router.program, "manual_brake", brake=True)
     with (
-        closing(FoxgloveServer(LOOPBACK, cast("Running", router))) as server,
+        closing(serve(router)) as server,
         FoxgloveClient(server.address.port) as client,
     ):
         client.subscribe("manual_brake")
@@ -251,8 +266,8 @@ def test_a_fault_is_told_once_and_does_not_end_the_view(
 def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> None:
     address = LOOPBACK
     for _ in range(3):
-        with closing(FoxgloveServer(address, cast("Running", router))) as server:
-            address = Located(server.address, SPAN)
+        with closing(serve(router, address)) as server:
+            address = server.address
             with FoxgloveClient(server.address.port) as client:
                 client.subscribe("imu_info")
                 router.wait_for(1)
@@ -262,11 +277,11 @@ def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> Non
 
 def test_an_address_that_cannot_be_had_is_told(router: Showing) -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
-        address = Located(Address("127.0.0.1", holder.getsockname()[1]), SPAN)
-        with pytest.raises(StartError, match=rf"rover.yaml:8:20: .*{address.value}: .*\(pid \d+\) has the port"):
-            FoxgloveServer(address, cast("Running", router))
-    with pytest.raises(StartError, match="no network interface of this computer has that address"):
-        FoxgloveServer(Located(Address("203.0.113.1", 1), SPAN), cast("Running", router))
+        address = Address("127.0.0.1", holder.getsockname()[1])
+        with pytest.raises(StartError, match=rf"rover.yaml:8:20: .*{address}: .*\(pid \d+\) has the port"):
+            serve(router, address)
+    with pytest.raises(StartError, match="this machine has no such address"):
+        serve(router, Address("203.0.113.1", 1))
 
 
 def test_who_speaks_another_protocol_is_turned_away_without_a_word_in_the_log(
@@ -276,3 +291,85 @@ def test_who_speaks_another_protocol_is_turned_away_without_a_word_in_the_log(
         connect(f"ws://127.0.0.1:{server.address.port}")
     server.close()
     assert "handshake" not in capfd.readouterr().err
+
+
+def handshake(server: FoxgloveServer, host: str = "", *, subprotocol: str = SUBPROTOCOL, **headers: str) -> bool:
+    """Whether the server lets a client in that names this host."""
+    with socket.create_connection(server.address, PATIENCE) as connection:
+        protocol = ClientProtocol(parse_uri(f"ws://{host or server.address}/"), subprotocols=[Subprotocol(subprotocol)])
+        request = protocol.connect()
+        request.headers.update(headers)
+        protocol.send_request(request)
+        connection.sendall(b"".join(protocol.data_to_send()))
+        return connection.recv(65536).startswith(b"HTTP/1.1 101 ")
+
+
+def test_the_app_and_pages_of_the_same_host_can_look(server: FoxgloveServer) -> None:
+    assert handshake(server)
+    assert handshake(server, subprotocol="foxglove.websocket.v1")
+    assert handshake(server, Origin=f"http://{server.address}")
+    assert handshake(server, "rover.example.org", Origin="https://app.foxglove.dev")
+    assert handshake(server, "rover.local:8766", Origin="https://rover.local:8766")
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("", "http://rover.example.org"),
+        ("", "https://app.foxglove.dev.example.org"),
+        ("", "null"),
+        ("rover.example.org:8766", "http://rover.example.org:8766"),
+        ("rover.example.org:8766", ""),
+    ],
+)
+def test_pages_of_other_hosts_cannot_look(server: FoxgloveServer, host: str, origin: str) -> None:
+    assert not handshake(server, host, **({"Origin": origin} if origin else {}))
+
+
+def test_clients_outside_the_networks_are_refused_and_counted(router: Showing, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "is_own_computer", lambda *_: False)
+    REFUSED.clear()
+    with capture_logs() as logs, closing(serve(router, networks=[IPv4Network("127.0.1.0/24")])) as server:
+        for host, is_let_in in (("127.0.1.1", True), ("127.0.2.1", False), ("127.0.2.1", False)):
+            with socket.create_connection(server.address, PATIENCE, source_address=(host, 0)) as connection:
+                connection.sendall(b"GET / HTTP/1.1\r\n\r\n")
+                try:
+                    answer = connection.recv(1000)
+                except ConnectionError:
+                    answer = b""
+                assert bool(answer) == is_let_in
+    assert REFUSED == {"foxglove": 2}
+    assert [(each["server"], each["client"]) for each in logs] == [("foxglove", "127.0.2.1")] * 2  # and a summary
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        "x",
+        "[]",
+        '{"op": "subscribe"}',
+        '{"op": "subscribe", "subscriptions": [7]}',
+        '{"op": "unsubscribe", "subscriptionIds": [[]]}',
+        "[" * 60_000,
+    ],
+)
+def test_nonsense_ends_its_own_connection_only(server: FoxgloveServer, client: FoxgloveClient, order: str) -> None:
+    with connect(f"ws://{server.address}", subprotocols=[Subprotocol(SUBPROTOCOL)]) as other:
+        other.send(order)
+        with pytest.raises(ConnectionClosedError, match="not a request of the protocol"):
+            all(map(other.recv, repeat(PATIENCE)))  # information and channels come first
+    client.subscribe("imu_info")
+
+
+def test_a_slow_client_loses_the_oldest_messages(program: Program, router: Showing, client: FoxgloveClient) -> None:
+    client.subscribe("imu_info")
+    router.wait_for(1)
+    sent = 60 * foxglove.BACKLOG
+    router_backlog = [envelope(program, "imu_info", accel_x=1.5)] * foxglove.BACKLOG
+    for number in range(60):  # the client's library reads some, and then pauses
+        router.show(*router_backlog, at=1 + number * foxglove.BACKLOG)
+    times = [client.receive().log_time]
+    while times[-1] != sent:
+        times.append(client.receive().log_time)
+    assert times == sorted(set(times))
+    assert len(times) < sent

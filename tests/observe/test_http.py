@@ -9,12 +9,11 @@ import json
 import re
 import select
 import socket
-import struct
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
-from email.message import Message
 from http import HTTPStatus
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +22,14 @@ from structlog.testing import capture_logs
 
 from router.errors import Code, Diagnostic, RouterError
 from router.log import logger
+from router.net import control, doors
 from router.observe import http as server_module
 from router.observe import responses, status
-from router.observe.http import (
-    MAX_ANSWERING,
-    MAX_FROM_OTHERS,
-    MAX_PER_HOST,
-    MAX_TAPS,
-    HttpServer,
-    is_own_page,
-    refusal,
-)
+from router.observe.http import MAX_ANSWERING, MAX_FROM_OTHERS, MAX_PER_HOST, MAX_TAPS, HttpServer, is_own_page
 from router.observe.responses import plain
 from router.observe.route_map import Edge, Node, nodes_and_edges
 from router.observe.running import ReloadResult
+from router.table.addresses import Address
 from router.table.model import RouteTable
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import SPAN, FakeRunning, served, sim_program
@@ -82,17 +75,32 @@ class Answer:
         return json.loads(self.data)
 
 
+def connected(server: HttpServer, *, is_owner: bool = False) -> http.client.HTTPConnection:
+    connection = http.client.HTTPConnection(*server.address, timeout=10)
+    if is_owner:
+        connection.sock = control.connect(*server.address, 10)
+    return connection
+
+
 @contextmanager
-def asking(server: HttpServer, path: str, method: str = "GET") -> Iterator[http.client.HTTPConnection]:
+def asking(
+    server: HttpServer, path: str, method: str = "GET", *, is_owner: bool = True
+) -> Iterator[http.client.HTTPConnection]:
     """A connection that has asked, and whose answer is not read yet."""
-    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+    with closing(connected(server, is_owner=is_owner)) as connection:
         connection.request(method, path)
         yield connection
 
 
 def ask(server: HttpServer, path: str, method: str = "GET", headers: Mapping[str, str] | None = None) -> Answer:
-    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+    with closing(connected(server)) as connection:
         connection.request(method, path, headers=dict(headers or {}))
+        return Answer(connection.getresponse())
+
+
+def order(server: HttpServer, path: str) -> Answer:
+    """Post as the router's user does, at the control socket."""
+    with asking(server, path, "POST") as connection:
         return Answer(connection.getresponse())
 
 
@@ -141,8 +149,6 @@ def test_a_head_without_a_body_tells_how_long_it_would_be(server: HttpServer) ->
     for path in ("/metrics", "/ready", "/", "/status.json", "/nothing"):
         head = ask(server, path, "HEAD")
         assert (head.data, int(head.headers["Content-Length"]) > 0) == (b"", True), path
-    head = ask(server, "/tap", "HEAD")
-    assert (head.status, head.data) == (200, b"")
 
 
 def test_a_connection_serves_one_question_after_the_other(server: HttpServer) -> None:
@@ -155,7 +161,7 @@ def test_a_connection_serves_one_question_after_the_other(server: HttpServer) ->
 
 def test_what_there_is_not_is_said(server: HttpServer) -> None:
     assert ask(server, "/nothing").status == 404
-    assert ask(server, "/-/nothing", "POST").status == 404
+    assert order(server, "/-/nothing").status == 404
     assert ask(server, "/-/reload").status == 405
     assert ask(server, "/map.json?" + "width=wide&" * 1000).status == 400
 
@@ -168,40 +174,58 @@ def test_no_page_says_where_the_table_is(server: HttpServer, running: FakeRunnin
 
 
 def test_an_order_to_reload_says_what_came_of_it(server: HttpServer, running: FakeRunning) -> None:
-    answer = ask(server, "/-/reload", "POST")
+    answer = order(server, "/-/reload")
     assert (answer.status, answer.json) == (200, {"ok": True, "text": "nothing has changed", "findings": []})
     finding = Diagnostic(SPAN, Code.UNKNOWN_FIELD, "there is no 'x'", "did you mean 'y'?")
     running.reloads = ReloadResult(False, (finding,), "nothing was changed: 1 error")
-    answer = ask(server, "/-/reload", "POST")
+    answer = order(server, "/-/reload")
     assert answer.status == 422
     assert answer.json["findings"] == ["routes/sim.yaml:8:20: error[unknown-field]: there is no 'x'; did you mean 'y'?"]
 
 
 def test_an_order_to_save_gives_the_file(server: HttpServer, saved: list[Path | RouterError]) -> None:
-    assert ask(server, "/record/save", "POST").json == {"ok": True, "file": "recordings/last.mcap"}
+    assert order(server, "/record/save").json == {"ok": True, "file": "recordings/last.mcap"}
     saved[0] = RouterError("the disk is full")
-    answer = ask(server, "/record/save", "POST")
+    answer = order(server, "/record/save")
     assert (answer.status, answer.json) == (409, {"ok": False, "text": "the disk is full"})
 
 
 def test_what_is_not_kept_cannot_be_saved(running: FakeRunning) -> None:
     with closing(served(running)) as server:
-        answer = ask(server, "/record/save", "POST")
+        answer = order(server, "/record/save")
     assert answer.status == 404
     assert "`last: 60s`" in answer.json["text"]
 
 
 @pytest.mark.parametrize(("method", "path"), [("POST", "/-/reload"), ("POST", "/record/save"), ("GET", "/tap")])
-def test_a_page_in_a_browser_can_neither_order_nor_tap(server: HttpServer, method: str, path: str) -> None:
-    for headers in (
-        {"Origin": "http://127.0.0.1:9108"},
-        {"Origin": ""},
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Host": "rover.example.org"},
-        {"Host": "rover.example.org:9108"},
-        {"Host": "127.0.0.1.example.org"},
-    ):
-        assert ask(server, path, method, headers).status == 403, headers
+def test_nobody_can_order_or_tap_over_tcp_whatever_a_proxy_sends(server: HttpServer, method: str, path: str) -> None:
+    """The router's own computer neither: a proxy on it passes on what strangers ask."""
+    for headers in ({}, {"Forwarded": "for=127.0.0.1"}, {"X-Forwarded-For": "127.0.0.1"}, {"Origin": ""}):
+        answer = ask(server, path, method, headers)
+        assert answer.status == 403, headers
+        assert re.fullmatch(r"only for user \w+ and root, with the command line on .*\n", answer.text)
+
+
+def test_another_user_of_the_computer_can_neither_order_nor_tap(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "_owners", lambda: (12345,))
+    assert order(server, "/-/reload").status == 403
+    with asking(server, "/tap") as connection:
+        assert connection.getresponse().status == 403
+
+
+def test_a_router_at_all_addresses_is_controlled_by_each_of_them(running: FakeRunning) -> None:
+    with closing(served(running, address=Address("0.0.0.0", 0))) as server:
+        connection = control.connect("127.0.0.1", server.address.port, 10)
+        connection.close()
+        with pytest.raises(OSError, match="Cannot assign requested address"):
+            control.connect("203.0.113.1", server.address.port, 10)
+
+
+def test_two_routers_never_share_a_control_socket(server: HttpServer) -> None:
+    with pytest.raises(OSError, match="Address already in use"):
+        control.listen(*server.address)
 
 
 def own_page(server: HttpServer, **others: str) -> dict[str, str]:
@@ -234,7 +258,7 @@ def test_pages_save_once_in_ten_seconds_and_the_command_line_whenever_it_likes(
     refused = ask(server, "/record/save", "POST", own_page(server))
     assert refused.status == 429
     assert re.fullmatch(r"a recording has just been saved: try again in ([1-9]|10) s", refused.json["text"])
-    assert ask(server, "/record/save", "POST").status == 200
+    assert order(server, "/record/save").status == 200
     monkeypatch.setattr(responses, "SAVE_SECONDS", 0)
     assert ask(server, "/record/save", "POST", own_page(server)).status == 200
 
@@ -245,7 +269,6 @@ def test_pages_save_once_in_ten_seconds_and_the_command_line_whenever_it_likes(
         {"Origin": "http://rover.example.org"},
         {"Origin": "http://127.0.0.1"},
         {"Origin": "http://127.0.0.1:1"},
-        {"Origin": "https://{host}"},
         {"Origin": "null"},
         {"Origin": ""},
         {"Sec_Fetch_Site": "cross-site"},
@@ -262,48 +285,65 @@ def test_a_page_from_elsewhere_cannot_save(server: HttpServer, headers: dict[str
     assert ask(server, "/record/save", "POST", own_page(server)).status == 200  # nothing was saved before
 
 
+def test_the_own_page_can_save_behind_a_proxy_with_tls(server: HttpServer) -> None:
+    headers = own_page(server, Host="rover.local:8443", Origin="https://rover.local:8443")
+    assert ask(server, "/record/save", "POST", headers).status == 200
+
+
 def test_the_own_page_can_save_and_nothing_else(server: HttpServer) -> None:
     assert ask(server, "/-/reload", "POST", own_page(server)).status == 403
     assert ask(server, "/tap", "GET", own_page(server)).status == 403
 
 
 @pytest.mark.parametrize(
-    ("hosts", "origins", "is_own"),
+    ("host", "origins", "is_own"),
     [
-        (["192.168.0.5:9108"], ["http://192.168.0.5:9108"], True),
-        (["localhost:9108"], ["http://localhost:9108"], True),
-        (["192.168.0.5:9108"], ["http://192.168.0.6:9108"], False),
-        (["192.168.0.5:9108", "192.168.0.5:9108"], ["http://192.168.0.5:9108"], False),
-        (["192.168.0.5:9108"], ["http://192.168.0.5:9108", "http://192.168.0.5:9108"], False),
-        ([], ["http://192.168.0.5:9108"], False),
-        (["192.168.0.5:9108"], [], False),
+        ("192.168.0.5:9108", ["http://192.168.0.5:9108"], True),
+        ("localhost:9108", ["http://localhost:9108"], True),
+        ("rover.lan", ["https://rover.lan"], True),
+        ("rover.example.org", ["https://rover.example.org"], False),
+        ("192.168.0.5:9108", ["http://192.168.0.6:9108"], False),
+        ("192.168.0.5:9108", ["http://192.168.0.5:9108", "http://192.168.0.5:9108"], False),
+        ("", ["http://192.168.0.5:9108"], False),
+        ("192.168.0.5:9108", [], False),
     ],
 )
-def test_whose_page_asks_is_told_by_its_origin(hosts: list[str], origins: list[str], is_own: bool) -> None:
-    headers = Message()
-    for name, values in (("Host", hosts), ("Origin", origins)):
-        for value in values:
-            headers[name] = value
-    assert is_own_page(headers) == is_own
+def test_whose_page_asks_is_told_by_its_origin(host: str, origins: list[str], is_own: bool) -> None:
+    assert is_own_page(host, {"origin": origins} if origins else {}) == is_own
 
 
-@pytest.mark.parametrize(
-    ("peer", "own", "hosts", "is_refused"),
-    [
-        ("127.0.0.1", "127.0.0.1", ["127.0.0.1:9108"], False),
-        ("127.0.7.1", "127.0.0.1", ["127.0.0.1:9108"], False),
-        ("192.168.0.5", "192.168.0.5", ["192.168.0.5:9108"], False),
-        ("192.168.0.6", "192.168.0.5", ["192.168.0.5:9108"], True),
-        ("127.0.0.1", "127.0.0.1", ["127.0.0.1:9108", "rover.example.org"], True),
-    ],
-)
-def test_only_the_own_computer_can_order_and_by_one_address(
-    peer: str, own: str, hosts: list[str], is_refused: bool
+@pytest.mark.parametrize("path", ["/", "/status.json", "/recent.json", "/map.json"])
+def test_pages_of_other_hosts_cannot_read_what_the_status_page_shows(server: HttpServer, path: str) -> None:
+    for headers in (
+        {"Host": "rover.example.org"},
+        {"Host": f"127.0.0.1.example.org:{server.address.port}"},
+        {"Origin": "http://rover.example.org"},
+        {"Origin": "null"},
+    ):
+        assert ask(server, path, headers=headers).status == 403, headers
+    for headers in ({}, {"Host": "rover"}, {"Host": "rover.local:8080"}, {"Origin": f"http://{server.address}"}):
+        assert ask(server, path, headers=headers).status == 200, headers
+
+
+def test_programs_can_read_numbers_by_any_name(server: HttpServer) -> None:
+    for path in ("/metrics", "/healthz", "/ready", "/health.json"):
+        assert ask(server, path, headers={"Host": "rover.example.org:9108"}).status == 200
+
+
+def test_clients_outside_the_networks_are_refused_and_counted(
+    running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    headers = Message()
-    for host in hosts:
-        headers["Host"] = host
-    assert (refusal(peer, own, headers) is not None) == is_refused
+    monkeypatch.setattr(doors, "is_own_computer", lambda *_: False)
+    with capture_logs() as logs, closing(served(running, networks=[IPv4Network("127.0.1.0/24")])) as server:
+        with ExitStack() as stack:
+            assert opened(server, stack, 1, "127.0.2.1")[0].recv(100).startswith(b"HTTP/1.1 403 ")
+            [admitted] = opened(server, stack, 1, "127.0.1.1")
+            admitted.sendall(b"GET /ready HTTP/1.0\r\n\r\n")
+            assert admitted.recv(100).startswith(b"HTTP/1.1 200 ")
+        assert order(server, "/-/reload").status == 200
+    assert [(each["event"], each["client"]) for each in logs] == [
+        ("connection refused: the client's address is not in a network of 'from'", "127.0.2.1")
+    ]
 
 
 def opened(server: HttpServer, stack: ExitStack, count: int, host: str = "127.0.0.1") -> list[socket.socket]:
@@ -534,13 +574,26 @@ def test_nonsense_ends_its_own_connection_only(
     assert not told
 
 
+def test_a_body_is_never_run_as_a_request(server: HttpServer, saved: list[Path | RouterError]) -> None:
+    """Request smuggling: a proxy passes on one request, and the router would see two."""
+    hidden = f"POST /record/save HTTP/1.1\r\nHost: {server.address}\r\nOrigin: http://{server.address}\r\n\r\n".encode()
+    for head in (b"GET /metrics HTTP/1.1\r\n", b"POST /record/save HTTP/1.1\r\n", b"HEAD / HTTP/1.1\r\n"):
+        for length in (b"Content-Length: %d\r\n" % len(hidden), b"Transfer-Encoding: chunked\r\n"):
+            with socket.create_connection(server.address, 10) as caller:
+                caller.sendall(head + b"Host: 127.0.0.1\r\n" + length + b"\r\n" + hidden)
+                answer = b"".join(iter(lambda: caller.recv(65536), b""))
+            assert answer.startswith(b"HTTP/1.1 400 Bad Request\r\n"), head
+            assert answer.count(b"HTTP/1.1 ") == 1
+            assert b"\r\nConnection: close\r\n" in answer
+    assert ask(server, "/record/save", "POST", own_page(server)).status == 200  # nothing was saved within 10 s before
+
+
 def test_closing_minds_nobody_who_has_gone(running: FakeRunning) -> None:
-    """His reset tells the kernel, but the thread that waits for his next question learns of it late."""
+    """The thread that waits for the next question learns of it late."""
     for _ in range(20):
         server = served(running)
-        callers = [socket.create_connection(server.address, 10) for _ in range(5)]
+        callers = [control.connect(*server.address, 10) for _ in range(5)]
         for caller in callers:
-            caller.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             caller.sendall(b"GET /tap HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             caller.close()
         server.close()

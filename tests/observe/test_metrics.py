@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import urllib.request
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from router.clock import boottime_ns
 from router.compiler.metrics import LATENCY_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
+from router.net.doors import Door
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import Running
@@ -32,6 +34,7 @@ LABELS = {
     "payload_case": "imu_info",
     "route": "imu_info",
     "mode": "peer",
+    "server": "http",
     "source": "sensor_board",
     "destination": "basestation",
     "topic": "imu_data",
@@ -89,7 +92,9 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     result = Scraped(indexes, threads, 0, LOOPBACK)
     computed = {"kernel_drops": lambda: [(["rover"], result.drops)]}
     collector = CountersCollector(counters, lambda: threads, computed, {LABELS["endpoint"]: 0}, BUILD)
-    with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), NO_HEALTH, None)) as server:
+    with closing(
+        HttpServer(LOOPBACK, SPAN, Door("http", (), Counter()), cast("Running", collector), NO_HEALTH, None)
+    ) as server:
         result.address = server.address
         yield result
 
@@ -164,4 +169,4 @@ def test_an_address_in_use_is_refused_with_who_has_it() -> None:
         taken = Address(*other.getsockname())
         collector = CountersCollector(Counters(), lambda: [[]], {}, {}, BUILD)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: cannot serve HTTP at {taken}: .*\(pid \d+\)"):
-            HttpServer(taken, SPAN, cast("Running", collector), NO_HEALTH, None)
+            HttpServer(taken, SPAN, Door("http", (), Counter()), cast("Running", collector), NO_HEALTH, None)

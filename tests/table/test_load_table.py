@@ -27,7 +27,7 @@ def route(table: RouteTable, name: str) -> Route:
 
 def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
     assert table.http
-    assert table.http.value == Address("127.0.0.1", 9108)
+    assert table.http.address.value == Address("127.0.0.1", 9108)
     assert flat(table.node) == {"name": "rover_router", "namespace": "/"}
     assert flat(table.listeners["rover"]) == {
         "name": "rover", "address": "0.0.0.0:5000", "framing": "exact", "receive_buffer": "64 kB",
@@ -187,7 +187,7 @@ def test_what_is_said_beside_routing_is_typed(tmp_path: Path) -> None:
     assert table.node.diagnostics
     assert table.node.diagnostics.line == 5
     assert table.foxglove
-    assert table.foxglove.value == Address("127.0.0.1", 8766)
+    assert table.foxglove.address.value == Address("127.0.0.1", 8766)
     assert table.reload_on_change
     assert [table.endpoints[name].stale_after for name in ("arm", "tool")] == [500_000_000, None]
     assert table.record

@@ -444,7 +444,7 @@ def test_who_answers_a_ping() -> None:
 def serving(program: Program, *problems: Problem) -> Iterator[None]:
     """A router that runs the program's table, and in which this is wrong."""
     assert program.table.http is not None
-    with answering("", program.table.http.value, problems=problems, table=program.table.sha256):
+    with answering("", program.table.http.address.value, problems=problems, table=program.table.sha256):
         yield
 
 
@@ -455,9 +455,9 @@ def told(table: Path) -> list[CheckResult]:
 
 @pytest.mark.parametrize("text", ["<html>hello</html>", "", "{}", "[]", '{"table": 1, "problems": 7}'])
 def test_another_program_at_the_routers_address_has_its_port(table: Path, text: str) -> None:
-    address = compiled(table).table.http
-    assert address is not None
-    with answering("", address.value, health=text):
+    http = compiled(table).table.http
+    assert http is not None
+    with answering("", http.address.value, health=text):
         [taken] = texts(list(examine(table, {})), Grade.PROBLEM)
     assert f"(pid {os.getpid()}) has tcp port" in taken
 

@@ -15,6 +15,7 @@ from router.gateway.transport.arrival import LoopClock
 from router.gateway.transport.base import LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
 from router.log import FloodLog, logger
+from router.net.doors import Door
 from router.table.addresses import Address
 
 PIECE = 64 * 1024
@@ -111,8 +112,11 @@ class StreamClient:
         drain: Callable[[], Awaitable[None]],
         is_open: Callable[[], bool] = lambda: True,
     ) -> None:
-        peer = connection.get_extra_info("peername") or ("a client that has left", 0)
+        peer = connection.get_extra_info("peername")
+        self.has_left_early = peer is None
+        peer = peer or ("a client that has left", 0)
         self.host: str = peer[0]
+        self.own_host: str = (connection.get_extra_info("sockname") or ("", 0))[0]
         self.label = f"{self.host}:{peer[1]}"
         self.unfinished_since: float | None = None
         self._owner = owner
@@ -190,14 +194,15 @@ class StreamClient:
 
 
 class StreamTransport(ABC):
-    """Listens, and enforces `limits` and the timeout for a message. `address` is known once it is bound."""
+    """Listens, and enforces `door`, `limits` and the timeout for a message. `address` is known once it is bound."""
 
-    def __init__(self, address: Address, events: Events, limits: Limits) -> None:
+    def __init__(self, address: Address, events: Events, limits: Limits, door: Door) -> None:
         self.address: Address | None = None
         self.events = events
         self.limits = limits
         self.clock = LoopClock()
         self.is_closing = False
+        self._door = door
         self._requested = address
         self._clients: set[StreamClient] = set()
         self._binding = Binding("tcp", address, self._bind)
@@ -217,6 +222,7 @@ class StreamTransport(ABC):
         await self._stop()
         self.clock.stop()
         self._log.flush(final=True)
+        self._door.close()
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
         encoded = self.encode(frames)
@@ -242,6 +248,10 @@ class StreamTransport(ABC):
             raise
         listening.listen(MOST_UNACCEPTED)
         self.address = Address(*listening.getsockname())
+
+    def admits(self, client: StreamClient) -> bool:
+        """Return whether the client is in a network that may connect; otherwise count and log it."""
+        return client.has_left_early or self._door.admits(client.host, client.own_host)
 
     def enter(self, client: StreamClient) -> str:
         """Add a client and return "", or return (and log) why it is rejected."""

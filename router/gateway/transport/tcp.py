@@ -10,6 +10,7 @@ from time import monotonic
 
 from router.gateway.transport.base import PER_TURN, Events, Frame, report_fault
 from router.gateway.transport.stream import ACCEPTED_PER_TURN, Encoded, Limits, StreamClient, StreamTransport, cut
+from router.net.doors import Door
 from router.table.addresses import Address
 
 LENGTH = struct.Struct("<I")
@@ -28,8 +29,8 @@ class TcpTransport(StreamTransport):
     A client whose message exceeds the limit is disconnected.
     """
 
-    def __init__(self, address: Address, events: Events, limits: Limits, *, prefixed: bool) -> None:
-        super().__init__(address, events, limits)
+    def __init__(self, address: Address, events: Events, limits: Limits, door: Door, *, prefixed: bool) -> None:
+        super().__init__(address, events, limits, door)
         self._prefixed = prefixed
         self._server: asyncio.Server | None = None
 
@@ -55,7 +56,7 @@ class TcpTransport(StreamTransport):
     async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client = StreamClient(self, writer.transport, writer.drain)  # type: ignore[arg-type]  # a server's transport
         try:
-            if not self.enter(client):
+            if self.admits(client) and not self.enter(client):
                 await self._read(client, reader)
         except TooLongError as error:  # the beginning of the next message is unknown
             self.events.refused("too_large")

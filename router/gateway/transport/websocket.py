@@ -35,6 +35,7 @@ from router.gateway.transport.stream import (
     together,
 )
 from router.log import logger
+from router.net.doors import Door, is_foreign
 from router.table.addresses import Address
 
 PING_SECONDS = 20.0
@@ -56,8 +57,10 @@ class WebsocketTransport(StreamTransport):
     A client whose message exceeds the limit is disconnected. `page` is HTML.
     """
 
-    def __init__(self, address: Address, events: Events, limits: Limits, *, text: bool, page: bytes) -> None:
-        super().__init__(address, events, limits)
+    def __init__(
+        self, address: Address, events: Events, limits: Limits, door: Door, *, text: bool, page: bytes
+    ) -> None:
+        super().__init__(address, events, limits, door)
         self._text = text
         self._page = Page(page)
         self._server: Server | None = None
@@ -103,7 +106,7 @@ class WebsocketTransport(StreamTransport):
         hosts = [each.client.host for each in self._connections]
         limits = Limits(self.limits.clients + STRANGERS, self.limits.clients_per_host + STRANGERS_PER_HOST, 0)
         self._connections.add(connection)
-        if self.is_closing or limits.exceeded_by(connection.client.host, hosts):
+        if self.is_closing or not self.admits(connection.client) or limits.exceeded_by(connection.client.host, hosts):
             connection.client.close()
 
     def disconnected(self, connection: Connection, error: Exception | None) -> None:
@@ -182,7 +185,8 @@ class Page:
     def answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None continues with the websocket handshake."""
         if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
-            if _is_cross_origin(request.headers):
+            origins = request.headers.get_all("Origin")
+            if origins and is_foreign(request.headers.get_all("Host"), origins):  # browsers always send an origin
                 return connection.respond(
                     HTTPStatus.FORBIDDEN,
                     "pages of other hosts may not connect; open the page at this computer's address\n",
@@ -206,20 +210,6 @@ class Page:
                 "Connection": "close",
             }
         )
-
-
-_LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
-"""IP addresses, and names that nobody can register on the internet."""
-
-
-def _is_cross_origin(headers: Headers) -> bool:
-    """Return whether a page of another host connects: otherwise any page that is open in a browser could publish.
-
-    Names that anybody can register are not trusted (DNS rebinding).
-    """
-    hosts = [host.lower() for host in headers.get_all("Host")]
-    origins = [origin.lower().partition("://")[2] for origin in headers.get_all("Origin")]
-    return any([origin] != hosts or not _LOCAL.fullmatch(origin) for origin in origins)
 
 
 def _serialized(opcode: Opcode, message: Sequence[Part]) -> Iterator[Sequence[Part]]:

@@ -1,0 +1,62 @@
+"""The control socket of a running router: taps, reloads and saving, for the router's user and root.
+
+It is an abstract Unix socket named after the HTTP address. It exists in that address's network namespace only, and the
+kernel says which user connects, so neither a proxy nor another computer reaches it.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+
+_BACKLOG = 64
+_CREDENTIALS = struct.Struct("3i")
+"""struct ucred of <sys/socket.h>: process, user, group."""
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return the listening control socket of a router that serves HTTP there. Raises OSError."""
+    listening = socket.socket(socket.AF_UNIX)
+    try:
+        listening.bind(_name(host, port))
+        listening.listen(_BACKLOG)
+    except BaseException:
+        listening.close()
+        raise
+    return listening
+
+
+def is_by_owner(connection: socket.socket) -> bool:
+    """Return whether the peer of a control socket is this process's user, or root."""
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    _, user, _ = _CREDENTIALS.unpack(credentials)
+    return user in _owners()
+
+
+def _owners() -> tuple[int, ...]:
+    return 0, os.geteuid()
+
+
+def connect(host: str, port: int, patience: float | None) -> socket.socket:
+    """Connect to the router of this computer that serves HTTP there. `host` is an IPv4 address. Raises OSError.
+
+    That router may serve all addresses of this computer.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((host, 0))  # otherwise another computer's address could mean this one's router
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(patience)
+    try:
+        try:
+            connection.connect(_name(host, port))
+        except ConnectionRefusedError:
+            connection.connect(_name("0.0.0.0", port))
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _name(host: str, port: int) -> str:
+    return f"\0rover-router/{host}:{port}"
