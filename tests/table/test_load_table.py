@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
+from ipaddress import IPv4Network
 from pathlib import Path
 
 import pytest
@@ -177,7 +178,8 @@ def test_a_recording_needs_a_directory_alone(tmp_path: Path) -> None:
 def test_what_is_said_beside_routing_is_typed(tmp_path: Path) -> None:
     table = good(
         tmp_path,
-        SMALL + "node: {diagnostics: true}\nfoxglove: {address: 127.0.0.1:8766}\nreload: {on_change: true}\n"
+        SMALL + "node: {diagnostics: true}\nfoxglove: {address: 127.0.0.1:8766, from: [10.0.0.0/8]}\n"
+        "reload: {on_change: true}\n"
         "endpoints:\n"
         "  arm: {address: 10.0.0.1:8, kind: board, stale_after: 500ms}\n"
         "  tool: {address: 10.0.0.2:8, kind: tool, stale_after: never}\n"
@@ -188,6 +190,7 @@ def test_what_is_said_beside_routing_is_typed(tmp_path: Path) -> None:
     assert table.node.diagnostics.line == 5
     assert table.foxglove
     assert table.foxglove.address.value == Address("127.0.0.1", 8766)
+    assert table.foxglove.networks == (IPv4Network("10.0.0.0/8"),)
     assert table.reload_on_change
     assert [table.endpoints[name].stale_after for name in ("arm", "tool")] == [500_000_000, None]
     assert table.record
