@@ -606,7 +606,7 @@ def test_rates_are_there_with_the_first_answer(browser: Browser, running: FakeRu
         running.count("datagrams_received", "rover", to=600)
         page = browser.open("about:blank")
         hold = "const get = window.fetch; let asked = 0; window.fetch = (path, ...more) => "
-        once = "path === '/status.json' && asked++ ? new Promise(() => {}) : get(path, ...more);"
+        once = "path === 'status.json' && asked++ ? new Promise(() => {}) : get(path, ...more);"
         page.call("Page.addScriptToEvaluateOnNewDocument", source=hold + once)
         page.go(f"http://{server.address}/")
         page.until("document.querySelector('#state').textContent === 'running'")
