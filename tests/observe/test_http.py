@@ -104,6 +104,13 @@ def order(server: HttpServer, path: str) -> Answer:
         return Answer(connection.getresponse())
 
 
+def test_target_may_be_a_whole_url_and_its_host_counts(server: HttpServer) -> None:
+    for target, answer in (("http://rover:9108/status.json", 200), ("http://rover.example.org/status.json", 403)):
+        with closing(connected(server)) as connection:
+            connection.request("GET", target, headers={"Host": "rover"})
+            assert connection.getresponse().status == answer
+
+
 def test_health_is_that_the_receive_thread_gets_further(server: HttpServer, running: FakeRunning) -> None:
     assert ask(server, "/healthz").status == 200
     running.is_stuck = True

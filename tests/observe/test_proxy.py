@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import socket
+import ssl
 import subprocess
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from websockets.sync.client import connect
 
+from router.errors import Located
+from router.net.doors import Door
+from router.observe.foxglove import SUBPROTOCOLS, FoxgloveServer
 from router.observe.http import HttpServer
 from router.observe.running import ReloadResult
 from router.table.addresses import Address
+from router.table.model import ServerSettings
 from tests.acceptance.site import ROOT, wait_until
 from tests.gateway.browser import Browser
 from tests.gateway.fake_gateway import FakeGateway
-from tests.observe.fake_running import FakeRunning, served, sim_program
+from tests.observe.fake_running import SPAN, FakeRunning, served, sim_program
 from tests.observe.test_requests import AMBIGUOUS
 from tests.ports import free_port
 
@@ -176,13 +184,16 @@ def test_pages_work_behind_the_proxy_of_the_guide(
     """Below a prefix, with TLS: the numbers, saving, and a gateway's page with its websocket."""
     port = free_port(kind=socket.SOCK_STREAM)
     certificate(tmp_path)
-    with closing(FakeGateway()) as gateway:
+    nowhere = ServerSettings(SPAN, Located(Address("127.0.0.1", 0), SPAN))
+    door = Door("foxglove", (), Counter())
+    with closing(FakeGateway()) as gateway, closing(FoxgloveServer(nowhere, door, running)) as foxglove:
         [block] = re.findall(r"^```nginx\n(.*?)^```$", GUIDE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
         for old, new in (
             ("listen 443 ssl", f"listen 127.0.0.1:{port} ssl"),
             ("/etc/ssl/", f"{tmp_path}/"),
             ("127.0.0.1:9108", str(server.address)),
             ("127.0.0.1:8765", f"127.0.0.1:{gateway.port}"),
+            ("127.0.0.1:8766", str(foxglove.address)),
         ):
             assert old in block
             block = block.replace(old, new)
@@ -204,3 +215,7 @@ def test_pages_work_behind_the_proxy_of_the_guide(
             assert page.evaluate("socket.url") == f"wss://127.0.0.1:{port}/rover/dashboard/"
             assert page.complaints() == []
             page.close()
+            trust = ssl.create_default_context(cafile=tmp_path / "rover.pem")
+            trust.check_hostname = False
+            with connect(f"wss://127.0.0.1:{port}/rover/foxglove/", ssl=trust, subprotocols=SUBPROTOCOLS) as viewer:
+                assert json.loads(viewer.recv(10))["op"] == "serverInfo"
