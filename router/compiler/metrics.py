@@ -268,6 +268,7 @@ TOPIC_STATES: Mapping[str, str] = {
     "several_types": "served with the table's type, or else with the one that most of its publishers use",
     "not_installed": "not served: its type is not installed here",
     "refused": "not served: the router uses the topic with another type, or ROS refuses the subscription",
+    "over_limit": "not served: `max_topics` others are",
 }
 """States of a topic that a gateway's patterns match."""
 

@@ -68,6 +68,10 @@ class TopicSelector:
     def selects(self, topic: str) -> bool:
         return self.chosen_by(topic) is not None
 
+    def names(self, topic: str) -> bool:
+        """Return whether `include` has the topic's exact name."""
+        return topic in self._named
+
     def chosen_by(self, topic: str) -> TopicPattern | None:
         """Return the first pattern that includes the topic, or None.
 
@@ -92,7 +96,7 @@ class TopicSelector:
     def _choice(self, topic: str) -> TopicPattern | None:
         if any(matches(topic) for matches in self._exclude):
             return None
-        if (is_hidden(topic) or topic in self._inbound) and topic not in self._named:
+        if (is_hidden(topic) or topic in self._inbound) and not self.names(topic):
             return None
         return next((pattern for pattern, matches in self._include if matches(topic)), None)
 

@@ -75,6 +75,7 @@ class GatewayService:
         async with AsyncExitStack() as closing:  # in reverse order: clients that join or send start tasks
             closing.callback(self.clients.log.flush, final=True)
             closing.callback(self._inbound.log.flush, final=True)
+            closing.callback(self._topics.log.flush, final=True)
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)
@@ -82,6 +83,7 @@ class GatewayService:
     async def _flush_logs(self) -> None:
         self.clients.log.flush()
         self._inbound.log.flush()
+        self._topics.log.flush()
 
     # -- Events --------------------------------------------------------------------------------------------------
 

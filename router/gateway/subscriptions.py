@@ -219,23 +219,42 @@ class Subscriptions:
         """Return the absolute names of these topics, as ROS resolves them."""
         return frozenset(map(self._topics.resolved, names))
 
-    async def discover(self, inbound: Collection[str], is_wanted: Callable[[str], bool]) -> dict[str, Selection]:
-        """Return the wanted topics that have publishers; on `inbound` topics this router's own do not count.
+    def is_of_table(self, topic: str) -> bool:
+        """Return whether the table has the topic."""
+        return topic in self._topics.types
 
-        Loads types, so that `join` is fast. Yields to other tasks between topics.
+    async def discover(
+        self, inbound: Collection[str], rank: Callable[[str], int | None], most: int
+    ) -> tuple[dict[str, Selection], set[str]]:
+        """Return topics that have publishers; on `inbound` topics this router's own do not count.
+
+        `rank` is None for topics that are not wanted. The `most` topics of the lowest ranks are selected, and their
+        types loaded, so that `join` is fast. Of the others only the names are returned. Yields to other tasks between
+        topics.
         """
         found: dict[str, Selection] = {}
-        for topic in self._topics.names():
-            await asyncio.sleep(0)
-            if not is_wanted(topic):
+        beyond: set[str] = set()
+        ranked: list[tuple[int, str]] = []
+        for number, topic in enumerate(self._topics.names(), 1):
+            if (place := rank(topic)) is not None:
+                ranked.append((place, topic))
+            if number % PER_TURN == 0:
+                await asyncio.sleep(0)
+        for number, (_, topic) in enumerate(sorted(ranked), 1):
+            if len(found) >= most:
+                if self._topics.has_publishers(topic):
+                    beyond.add(topic)
+                if number % PER_TURN == 0:
+                    await asyncio.sleep(0)
                 continue
+            await asyncio.sleep(0)
             publishers, table_type = self._topics.publishers(topic), self._topics.types.get(topic)
             if selection := select(publishers, is_inbound=topic in inbound, table_type=table_type):
                 found[topic] = selection
                 if selection.type_name not in self._types:
                     ready = await self._loop.run_in_executor(self._loader, self._load, selection.type_name)
                     self._types[selection.type_name] = ready
-        return found
+        return found, beyond
 
     def is_joined(self, topic: str, callback: OnSample | None) -> bool:
         """Return whether the subscription that `join` with this `callback` would use exists."""

@@ -22,7 +22,7 @@ from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import NotInstalledError, TopicSubscription
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Frame
-from router.log import logger
+from router.log import FloodLog, logger
 from router.table.model import EACH, GatewayFormat, Transport
 
 MOST_TURNS = 20
@@ -42,12 +42,18 @@ DRAIN_S, SHOW_S = 1.0, 10.0
 SHORTEST_TURN = 10_000_000
 """The minimum time between turns, ns: shorter ones cost more than they gain."""
 
+MOST_NAMED = 5
+"""Maximum topics that a line of the log names."""
+
 FIRST_PAUSES_S = (0.2, 0.5, 1.0, 2.0)
 """Times between the first discoveries, if shorter than `discovery_period`: DDS takes a moment to find others."""
 
 
 class Topics:
-    """The topics of one gateway. Runs in the loop's thread. A fault in one topic is reported and affects no other."""
+    """The topics of one gateway. Runs in the loop's thread. A fault in one topic is reported and affects no other.
+
+    Flush `log` regularly.
+    """
 
     def __init__(
         self,
@@ -72,6 +78,8 @@ class Topics:
         self._selector = TopicSelector(plan.settings, self._inbound)
         self._served: dict[str, ServedTopic] = {}
         self._not_served: dict[str, str] = {}  # by topic: its state
+        self._over_limit: set[str] = set()
+        self.log = FloodLog()
         self._numbers = count()
         self._discover_now = asyncio.Event()
         self._is_udp = plan.settings.transport.value is Transport.UDP
@@ -109,7 +117,8 @@ class Topics:
 
     async def _update(self) -> None:
         """Serve new topics, forget those that are gone, and follow changes of types and QoS."""
-        found = await self._subscriptions.discover(self._inbound, self._selector.selects)
+        most = self._plan.settings.max_topics
+        found, over_limit = await self._subscriptions.discover(self._inbound, self._rank, most)
         if not self._clients:
             # While a topic has subscribers, the router publishes on it: do not subscribe without clients.
             found = {topic: selection for topic, selection in found.items() if not selection.is_ours}
@@ -124,7 +133,30 @@ class Topics:
             elif served.period == EACH:
                 self._sender.count_missed(served)
         served_as = ("several_types" if served.selection.others else "served" for served in self._served.values())
-        self._counters.topics(Counter(chain(served_as, self._not_served.values())))
+        self._counters.topics(Counter(chain(served_as, self._not_served.values(), repeat("over_limit", len(over_limit)))))
+        self._log_over_limit(over_limit)
+
+    def _rank(self, topic: str) -> int | None:
+        """Return which topics come first if there are more than `max_topics`; None for those that are not wanted."""
+        if not self._selector.selects(topic):
+            return None
+        if self._selector.names(topic) or self._subscriptions.is_of_table(topic):
+            return 0
+        return 1 if topic in self._served else 2
+
+    def _log_over_limit(self, topics: set[str]) -> None:
+        """Log which topics are not served because of `max_topics`, if there are new ones."""
+        if new := topics - self._over_limit:
+            self.log.note(
+                "over_limit",
+                logger.warning,
+                "too many topics; name those that you need in `include`, or raise `max_topics`",
+                gateway=self._name,
+                max_topics=self._plan.settings.max_topics,
+                not_served=len(topics),
+                such_as=sorted(new)[:MOST_NAMED],
+            )
+        self._over_limit = topics
 
     def _try_to_serve(self, topic: str, selection: Selection) -> None:
         try:

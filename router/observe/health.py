@@ -84,6 +84,7 @@ REMEDIES: Mapping[str, str] = {
     "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",
     "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
     "not_installed": "`router explain {route} --live` shows their types: source their packages, or exclude the topics.",
+    "over_limit": "The log names some. Name those that you need in `include`, exclude others, or raise `max_topics`.",
     "refused": "The log names them, with the reason. If the table has them with another type, exclude them.",
 }
 """Remedies by the reason of a loss, or the state of a gateway's topic."""

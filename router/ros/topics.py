@@ -68,6 +68,11 @@ class RosTopics:
             for seen in self._query(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
         ]
 
+    def has_publishers(self, topic: str) -> bool:
+        """Return whether `topic` has publishers, without the cost of looking at them."""
+        with self._handle:
+            return bool(self._handle.get_count_publishers(topic))
+
     def resolved(self, name: str) -> str:
         """Return the absolute name of a topic, from the node's namespace and remaps."""
         return str(self._node.resolve_topic_name(name))

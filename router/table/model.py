@@ -544,6 +544,7 @@ class Gateway:
     rates: tuple[TopicRate, ...] = ()
     max_datagram: Annotated[int, DATAGRAM_SIZE] = 1400
     max_message: Annotated[int | None, MESSAGE_SIZE] = None
+    max_topics: int = 500
     max_clients: int = 1024
     max_clients_per_host: int = 16
     networks: Annotated[tuple[IPv4Network, ...], Named("from")] = ()

@@ -288,7 +288,10 @@ def explained_gateway(checked: GatewayPlan, topics: Topics) -> Iterator[str]:
     yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
     yield f"  messages of up to {gateway.max_outbound} bytes{_gateway_sizes(gateway)}"
     yield from _patterns(gateway)
-    yield from _matched(TopicSelector(gateway, checked.inbound), topics)
+    matched = list(_matched(TopicSelector(gateway, checked.inbound), topics))
+    yield from matched
+    if len(matched) > gateway.max_topics:
+        yield f"  serves at most {gateway.max_topics} of these {len(matched)} topics (max_topics)"
     for inbound in checked.inbound.values():
         yield ""
         yield from _inbound(inbound)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, cast
 
 from router.carrier.library import load
@@ -80,8 +80,11 @@ class Tap:
 class Graph:
     """A ROS graph: topics by name, each with one publisher. `faults` are errors to raise, by topic or for "names"."""
 
-    def __init__(self, types: Mapping[str, str]) -> None:
-        self.types = dict(types)
+    types: Mapping[str, str] = MappingProxyType({})
+    """The table's topics."""
+
+    def __init__(self, topics: Mapping[str, str]) -> None:
+        self.topics = dict(topics)
         self.faults: dict[str, Exception] = {}
         self.taps: dict[str, Tap] = {}
 
@@ -91,10 +94,13 @@ class Graph:
     def names(self) -> list[str]:
         if fault := self.faults.pop("names", None):
             raise fault
-        return [*self.types]
+        return [*self.topics]
 
     def publishers(self, topic: str) -> list[DiscoveredPublisher]:
-        return [DiscoveredPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False, gid=b"one")]
+        return [DiscoveredPublisher(self.topics[topic], is_reliable=True, keeps=False, is_ours=False, gid=b"one")]
+
+    def has_publishers(self, topic: str) -> bool:
+        return topic in self.topics
 
     def installed_type(self, type_name: str) -> MessageType:
         raise StartError(f"{type_name} is not installed")

@@ -67,6 +67,29 @@ async def test_a_topic_with_a_fault_keeps_no_other_from_being_served(tmp_path: P
 
 
 @asynchronous
+async def test_topics_beyond_the_limit_are_named_and_not_subscribed_and_a_named_topic_comes_first(
+    tmp_path: Path,
+) -> None:
+    graph = Graph({f"/stranger/{number}": STRING for number in range(5)})
+    limited = f"{TCP}, topics: {{include: ['/**', /wanted]}}, max_topics: 3"
+    async with Stage(program(tmp_path, f"it: {{{limited}}}"), graph) as stage:
+        with capture_logs() as logs:
+            await stage.played["it"].start()
+            await until(lambda: stage.count("gateway_topics", "it", "served") == 3)
+        assert [*graph.taps] == ["/stranger/0", "/stranger/1", "/stranger/2"]
+        assert stage.count("gateway_topics", "it", "over_limit") == 2
+        [line] = [line for line in logs if line["log_level"] == "warning"]
+        assert (line["not_served"], line["such_as"]) == (2, ["/stranger/3", "/stranger/4"])
+        graph.topics |= {"/a_stranger": STRING, "/wanted": STRING}
+        await until(lambda: stage.count("gateway_topics", "it", "over_limit") == 4)
+        assert "/wanted" in graph.taps
+        assert "/a_stranger" not in graph.taps  # those that are served stay
+        graph.topics = {"/wanted": STRING}
+        await until(lambda: stage.count("gateway_topics", "it", "served") == 1)
+        assert stage.count("gateway_topics", "it", "over_limit") == 0
+
+
+@asynchronous
 async def test_what_comes_faster_than_each_can_be_handed_on_is_in_the_books(tmp_path: Path) -> None:
     graph = Graph({"/fast": STRING})
     async with Stage(program(tmp_path, f"it: {{{EACH}}}"), graph) as stage:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing
 from itertools import pairwise
 from pathlib import Path
@@ -57,11 +57,17 @@ async def opened(*publishers: TopicPlan) -> AsyncIterator[Subscriptions]:
         yield subscriptions
 
 
+async def found(
+    subscriptions: Subscriptions, topics: Collection[str], inbound: Collection[str] = ()
+) -> dict[str, Selection]:
+    return (await subscriptions.discover(inbound, lambda topic: 0 if topic in topics else None, 1000))[0]
+
+
 async def seen(subscriptions: Subscriptions, condition: Callable[[Selection], bool] = lambda _: True) -> Selection:
     """What is seen of /greeting as soon as it is published so."""
     deadline = asyncio.get_running_loop().time() + PATIENCE_S
     while True:
-        choice = (await subscriptions.discover((), lambda topic: topic == "/greeting")).get("/greeting")
+        choice = (await found(subscriptions, ["/greeting"])).get("/greeting")
         if choice and condition(choice):
             return choice
         assert asyncio.get_running_loop().time() < deadline, f"it was never published like that: {choice}"
@@ -93,12 +99,22 @@ async def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: P
     async with opened(string_topic(topic="own")) as subscriptions:
         keepers = (await seen(subscriptions)).keepers
         assert len(keepers) == 1
-        assert await subscriptions.discover((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
+        assert await found(subscriptions, ["/greeting", "/own", "/nobody"]) == {
             "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=(), keepers=keepers),
             "/own": OURS,
         }
-        assert await subscriptions.discover(["/own"], lambda topic: topic == "/own") == {}
-        assert await subscriptions.discover((), lambda _: False) == {}
+        assert await found(subscriptions, ["/own"], inbound=["/own"]) == {}
+        assert await found(subscriptions, []) == {}
+
+
+@asynchronous
+async def test_of_too_many_topics_those_of_the_lowest_rank_are_found_and_the_others_named() -> None:
+    async with opened(*(string_topic(topic=name) for name in "abc")) as subscriptions:
+        await found(subscriptions, ["/a", "/b", "/c"])
+        ranks = {"/a": 2, "/b": 2, "/c": 1, "/rosout": None}
+        assert subscriptions.is_of_table("/a")
+        chosen, beyond = await subscriptions.discover((), ranks.get, 2)
+        assert (chosen, beyond) == ({"/a": OURS, "/c": OURS}, {"/b"})
 
 
 @asynchronous
@@ -111,10 +127,11 @@ async def test_looking_lets_others_have_their_turn_between_topics() -> None:
             turns += 1
             await asyncio.sleep(0)
 
-    async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as subscriptions:
-        await subscriptions.discover((), lambda _: True)  # the type is ready from here on
+    numbers = [f"/number_{number}" for number in range(20)]
+    async with opened(*(string_topic(topic=number[1:]) for number in numbers)) as subscriptions:
+        await found(subscriptions, numbers)  # the type is ready from here on
         task = asyncio.get_running_loop().create_task(other())
-        assert len(await subscriptions.discover((), lambda topic: topic.startswith("/number_"))) == 20
+        assert len(await found(subscriptions, numbers)) == 20
         assert turns >= 20
         task.cancel()
 

@@ -96,6 +96,7 @@ TWIST, DRIVE = "geometry_msgs/msg/Twist", "comms/msg/DrivingBoardMotorMessage"
             "dashboard does not serve topics: not_installed, 2 of them",
         ),
         ("gateway_topics dashboard several_types", 9, None),
+        ("gateway_topics dashboard over_limit", 9, "dashboard does not serve topics: over_limit, 9 of them"),
         ("gateway_topics dashboard refused", 1, "dashboard does not serve topics: refused, 1 of them"),
         (
             "type_incompatible drive_motor drive_motor publisher geometry_msgs/msg/Twist true",

@@ -27,7 +27,7 @@ def test_a_gateway_is_typed(tmp_path: Path) -> None:
         "format": "gateway_v2", "topics.include": "/rover/**, {regex: /imu/.*}", "topics.exclude": "/rover/camera/**",
         "publish_period": "each", "schema_period": "1 s", "discovery_period": "2 s", "compression.zstd": "3",
         "rates": "/rover/imu: 50 Hz, /tf: each, /slow: 0.5 Hz", "max_datagram": "8 kB", "max_message": "1 MiB",
-        "max_clients": "1024", "max_clients_per_host": "16",
+        "max_topics": "500", "max_clients": "1024", "max_clients_per_host": "16",
         "inbound.0.topic.topic": "/cmd_vel", "inbound.0.topic.type": "geometry_msgs/msg/Twist",
         "inbound.0.topic.qos.depth": "3", "inbound.0.ttl": "300 ms", "inbound.0.max_lead": "2 s",
         "inbound.0.topic.max_rate": "20 Hz",
@@ -62,7 +62,7 @@ def test_what_is_left_out_has_a_default(tmp_path: Path, transport: str, kind: st
     assert flat(found) == {
         "name": "it", "transport": kind, **where, "format": format_, "publish_period": "500 ms",
         "schema_period": "5 s", "discovery_period": "5 s", "compression.zstd": "0", "max_datagram": "1400 B",
-        "max_clients": "1024", "max_clients_per_host": "16",
+        "max_topics": "500", "max_clients": "1024", "max_clients_per_host": "16",
     }  # fmt: skip
     assert (found.max_outbound, found.max_inbound) == (16 << 20, 64 << 10)
 
