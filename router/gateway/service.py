@@ -20,7 +20,9 @@ from router.table.model import Transport as Way
 
 _TOPICS_S = _LOG_S = 1.0
 _ANSWER_NS = 100_000_000
-"""ns between two answers to schema requests: a small request has a large answer."""
+"""ns between two answers to schema requests: a small request has a large answer. Also between two rejections that all
+in a network get.
+"""
 
 
 class GatewayService:
@@ -48,9 +50,10 @@ class GatewayService:
         self.clients = Clients(self.name, self._transport, self._encoding, counters, context.clock_ns, context.wall_s)
         sender = TopicSender(settings, context, self._encoding, counters, self._tasks, self.clients)
         self._topics = Topics(plan, context, sender, counters, self._tasks, self.clients)
-        self._answered = -_ANSWER_NS
+        self._answered = self._explained = -_ANSWER_NS
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
-        self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
+        self._explains = self._encoding.style is Style.PLAIN
+        self._is_shared = settings.transport.value is Way.ZENOH  # its one client is the network
 
     def replacement(self) -> GatewayService:
         """Return a new service to replace this closed one: with the same limits and counters, without clients."""
@@ -130,7 +133,10 @@ class GatewayService:
 
     def _send_refusal(self, client: Client, refused: RefusedError) -> None:
         queue = self.clients.queues.get(client)
-        if self._explains and queue is not None:
+        now = self._context.clock_ns()
+        is_due = not self._is_shared or now - self._explained >= _ANSWER_NS
+        if self._explains and queue is not None and is_due:
+            self._explained = now
             document = rejected_document(refused.reason, str(refused), refused.topic)
             self.clients.send_to(queue, [self._document("rejected", document)])
 

@@ -30,6 +30,10 @@ def cdr(text: str) -> bytes:
     return b"\0\1\0\0" + len(data).to_bytes(4, "little") + data
 
 
+def publish(topic: str, data: object, **others: object) -> bytes:
+    return json.dumps({"op": "publish", "topic": topic, "data": {"data": data}, **others}).encode()
+
+
 @asynchronous
 async def test_a_value_that_another_gateway_has_taken_comes_to_a_client_that_was_there_before(tmp_path: Path) -> None:
     graph = Graph({"/map": STRING})
@@ -137,12 +141,29 @@ async def test_a_client_that_asks_for_schemas_too_often_is_told(tmp_path: Path) 
         assert (answer["op"], answer["reason"]) == ("rejected", "rate_limited")
 
 
+@pytest.mark.parametrize(
+    ("transport", "told"), [("{tcp: 127.0.0.1:8600}, format: json_lines", 3), ("{zenoh: {key: a}}, format: json", 1)]
+)
+@asynchronous
+async def test_a_client_is_told_why_a_command_was_rejected_and_a_network_not_more_often_than_it_is_bounded(
+    tmp_path: Path, transport: str, told: int
+) -> None:
+    gateway = f"transport: {transport}, inbound: [{{topic: /said, type: {STRING}, ttl: 500ms}}]"
+    async with Stage(program(tmp_path, f"it: {{{gateway}}}"), Graph({})) as stage:
+        played = stage.played["it"]
+        await played.start()
+        for data in (publish("/said", "x", time=time.time() - 2), publish("/said", 1, time=time.time()), b"{}"):
+            played.service.received(played.client, data, time.time_ns())
+        answers = [json.loads(frame.data) for frame in played.client.frames]
+        assert [answer["reason"] for answer in answers] == ["stale", "invalid", "malformed"][:told]
+        assert {answer["op"] for answer in answers} == {"rejected"}
+        await asyncio.sleep(0.15)
+        played.service.received(played.client, b"{}", time.time_ns())
+        assert len(played.client.frames) == told + 1
+
+
 TWO = "inbound: [{topic: /said, type: std_msgs/msg/String}, {topic: /set, type: std_msgs/msg/Int32}]"
 TIMED = "inbound: [{topic: /said, type: std_msgs/msg/String, ttl: 500ms}]"
-
-
-def publish(topic: str, data: object, **others: object) -> bytes:
-    return json.dumps({"op": "publish", "topic": topic, "data": {"data": data}, **others}).encode()
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,14 @@ async def test_data_is_found_by_topic_and_schemas_by_type() -> None:
 
 
 @asynchronous
+async def test_a_document_without_a_topic_is_found_by_its_kind() -> None:
+    async with serving() as served, listening(served) as heard:
+        served.client.write([data(b"why", "rejected", ""), data(b"a value", "/rejected")])
+        await until(lambda: len(heard) == 2)
+        assert heard == [(f"{KEY}/rejected", b"why"), (f"{KEY}/data/rejected", b"a value")]
+
+
+@asynchronous
 async def test_what_is_put_under_inbound_is_heard() -> None:
     async with serving(most=100) as served, sending(served) as far:
         far.put(f"{KEY}/inbound/cmd_vel", b"go")
@@ -293,6 +301,13 @@ def test_what_the_config_says_of_scouting_goes_before_what_the_gateway_would(ena
     assert config.get_json("scouting/multicast/enabled") == (enabled or "false")
     assert config.get_json("mode") == '"peer"'
     assert config.get_json("listen/endpoints") == '["tcp/127.0.0.1:7447"]'
+
+
+@pytest.mark.parametrize("closes", ["true", "false", None])
+def test_links_close_when_a_certificate_expires_unless_the_config_says_no(closes: str | None) -> None:
+    text = f'{{"transport": {{"link": {{"tls": {{"close_link_on_expiration": {closes}}}}}}}}}' if closes else "{}"
+    config = session_config(replace(settings(), config=ZenohConfig(SourceSpan("routes/rover.yaml"), text)))
+    assert config.get_json("transport/link/tls/close_link_on_expiration") == (closes or "true")
 
 
 RULE = {"id": "a", "permission": "allow", "messages": ["put"], "key_exprs": ["**"]}

@@ -500,7 +500,9 @@ class Putter:
 
 def key_of(root: str, frame: Frame) -> str:
     """Return the key of a frame below the gateway's own key."""
-    return f"{root}/schema/{frame.type_name}" if frame.is_schema else f"{root}/data/{frame.topic.lstrip('/')}"
+    if frame.is_schema:
+        return f"{root}/schema/{frame.type_name}"
+    return f"{root}/data/{frame.topic.lstrip('/')}" if frame.type_name else f"{root}/{frame.topic}"
 
 
 def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -> zenoh.ZError | None:

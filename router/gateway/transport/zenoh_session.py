@@ -48,6 +48,7 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
     unless_said: dict[str, object] = {
         "scouting/multicast/enabled": not settings.connect and not settings.listen,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": LARGE_MESSAGE_US,
+        "transport/link/tls/close_link_on_expiration": True,  # of the other side's certificate
     }
     values = {key: value for key, value in unless_said.items() if is_default(config, key)}
     values["mode"] = settings.mode
