@@ -38,6 +38,9 @@ if [ $# -gt 0 ]; then
   check_place "$chosen"
 fi
 
+echo "install-service: runs code of $root as root, which '$(stat -c %U "$root")' can change: .venv/env.sh," \
+  ".venv/bin/python and router/; it also runs $settings; the service runs as '$user'"
+
 # What the units need from the table: lines "socket ADDRESS INTERFACE" (- for none), "write FOLDER" and "read FOLDER".
 # Findings go to stderr.
 facts=$(

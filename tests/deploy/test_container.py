@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -74,13 +75,35 @@ def test_a_service_uses_the_hosts_network_and_mounts_what_there_is(name: str) ->
     for mounted in service["volumes"]:
         source = mounted.split(":")[0]
         assert (FOLDER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"]
-    assert "build" in service or re.search(r":v?\d+\.\d+\.\d+$", service["image"])
+    assert "build" in service or re.fullmatch(r"\$\{[A-Z]+_IMAGE:-\S+:v?\d+\.\d+\.\d+\}", service["image"])
+    assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
+    assert service["security_opt"] == ["no-new-privileges:true"]
 
 
 def test_compose_builds_this_dockerfile_in_the_root_of_the_checkout() -> None:
     build = COMPOSE["services"]["router"]["build"]
     assert (FOLDER / build["context"]).resolve() == ROOT
     assert ROOT / build["dockerfile"] == FOLDER / "Dockerfile"
+
+
+def test_all_images_can_be_pinned_and_pinned_again(tmp_path: Path) -> None:
+    for name in ("compose.yaml", "pin.sh"):
+        shutil.copy(FOLDER / name, tmp_path)
+    docker = tmp_path / "docker"
+    (tmp_path / ".env").write_text("BASESTATION=10.0.0.2:9000\n")
+    for digest in ("sha256:old", "sha256:new"):
+        docker.write_text(f'#!/bin/sh\n[ "$1 $2 $3" = "buildx imagetools inspect" ] && echo {digest}\n')
+        docker.chmod(0o755)
+        environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+        subprocess.run([tmp_path / "pin.sh"], env=environment, check=True)
+    assert (tmp_path / ".env").read_text().splitlines() == [
+        "BASESTATION=10.0.0.2:9000",
+        "ROS_IMAGE=ros:jazzy-ros-base@sha256:new",
+        "PROMETHEUS_IMAGE=prom/prometheus:v3.5.0@sha256:new",
+        "GRAFANA_IMAGE=grafana/grafana:12.1.0@sha256:new",
+    ]
+    used = re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)
+    assert used == ["${ROS_IMAGE}"] * 2
 
 
 def test_grafana_is_provisioned_with_our_prometheus_and_our_dashboard() -> None:

@@ -39,9 +39,10 @@ def analyze(*arguments: object) -> str:
     return finished.stdout + finished.stderr
 
 
-def test_the_service_may_do_little() -> None:
-    out = analyze("security", "--offline=true", "--no-pager", "rover-router.service")
-    exposed = re.search(r"Overall exposure level for rover-router.service: ([\d.]+)", out)
+@pytest.mark.parametrize("name", ["rover-router.service", "rover-router-hold.service"])
+def test_a_service_may_do_little(name: str) -> None:
+    out = analyze("security", "--offline=true", "--no-pager", name)
+    exposed = re.search(rf"Overall exposure level for {name}: ([\d.]+)", out)
     assert exposed is not None, out
     assert float(exposed[1]) <= MOST_EXPOSED
 
@@ -88,12 +89,24 @@ def refusing(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refusal(checkout: Path) -> str:
+def refused(checkout: Path) -> subprocess.CompletedProcess[str]:
     command = [checkout / "deploy" / "install-service.sh", checkout / "routes" / "rover.yaml"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert finished.returncode == 1
-    return finished.stderr
+    return finished
+
+
+def refusal(checkout: Path) -> str:
+    return refused(checkout).stderr
+
+
+def test_it_says_what_runs_as_root_and_who_can_change_that(refusing: Path) -> None:
+    os.chown(refusing, 65534, -1)
+    assert refused(refusing).stdout == (
+        f"install-service: runs code of {refusing} as root, which 'nobody' can change: .venv/env.sh, .venv/bin/python "
+        "and router/; it also runs /etc/default/rover-router; the service runs as 'rover-router'\n"
+    )
 
 
 def test_an_environment_that_reads_unset_variables_is_sourced(refusing: Path) -> None:
