@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import signal
 import statistics
 import sys
@@ -26,13 +27,16 @@ from pathlib import Path
 from benchmarks.fleet.actors import Told
 from benchmarks.fleet.figures import Figures, carried, counted, dropped, first_after, imbalances, spread
 from benchmarks.fleet.report import report, wrong
-from benchmarks.fleet.site import PATIENCE, Fleet, cpu_ns, memory
+from benchmarks.fleet.site import PATIENCE, Fleet, cpu_ns, entries, memory
 from benchmarks.versus.results import commit, machine
 from demo.places import alone
 from router.observe.snapshot import Snapshot
 
 DOWN = 2.0
 """Seconds for which the hub is away, and an operator is gone."""
+
+CUT = 22.0
+"""Seconds for which half of the rovers are cut off from the hub: it notices after 10 s, and Linux 10 s later."""
 
 DRAIN = 1.0
 """Seconds without an arrival after which nothing is on its way."""
@@ -68,6 +72,7 @@ def main() -> int:
         fleet.start(others)
         results["all"] = measured(fleet, everybody, args.seconds)
         results["hub"] = without_hub(fleet, everybody)
+        results["links"] = without_links(fleet, everybody)
         results["operator"] = without_operator(fleet, everybody)
     results["wrong"] = [*results["one"].pop("wrong"), *results["all"].pop("wrong"), *wrong(results, args.rovers)]
     print(report(results))
@@ -78,8 +83,8 @@ def main() -> int:
 
 def enter_namespace() -> None:
     """Run this program again in a network namespace of its own."""
-    if (wrapper := alone()) is None:
-        raise SystemExit("a fleet needs `unshare`, `ip` and the right to make a network namespace")
+    if (wrapper := alone()) is None or shutil.which("nft") is None:
+        raise SystemExit("a fleet needs `unshare`, `ip`, `nft` and the right to make a network namespace")
     os.environ[INSIDE] = "1"
     os.execvp(wrapper[0], [*wrapper, sys.executable, "-m", "benchmarks.fleet", *sys.argv[1:]])  # noqa: S606
 
@@ -192,6 +197,32 @@ def without_hub(fleet: Fleet, rovers: Sequence[int]) -> Figures:
         "brake_after_ms": spread([*brakes.values()]),
         "driven_again_after_ms": spread([*first_after(boards.received, back).values()]),
         "heard_again_after_ms": spread([*first_after(operators.received, back).values()]),
+    }
+
+
+def without_links(fleet: Fleet, rovers: Sequence[int]) -> Figures:
+    """Half of the rovers are cut off from the hub for a while."""
+    time.sleep(2 * DRAIN)
+    take(fleet)
+    lost, others = rovers[::2], rovers[1::2]
+    fleet.cut(lost)
+    cut = time.monotonic_ns()
+    time.sleep(CUT)
+    hub = {"threads": entries(fleet.hub.pid, "task"), "descriptors": entries(fleet.hub.pid, "fd")}
+    boards, _ = take(fleet)
+    fleet.mend()
+    back = time.monotonic_ns()
+    later, _ = await_flow(fleet, rovers, back)
+    brakes = first_after(boards.brakes, cut)
+    return {
+        "lost": len(lost),
+        "lost_braked": len(brakes.keys() & set(lost)),
+        "brake_after_ms": spread([after for rover, after in brakes.items() if rover in lost]),
+        "driven_again_after_ms": spread([*(first_after(later.received, back)[rover] for rover in lost)]),
+        "others": len(others),
+        "others_braked": len(brakes.keys() & set(others)),
+        "others_gap_ms": spread([gap for rover in others for gap in waits(boards, rover)]),
+        "hub": hub,
     }
 
 

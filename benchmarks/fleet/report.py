@@ -32,8 +32,12 @@ ROWS = {
 
 def wrong(results: Figures, rovers: int) -> list[str]:
     """Deadmen that did not trip, or tripped though commands came."""
-    hub, operator = results["hub"], results["operator"]
+    hub, links, operator = results["hub"], results["links"], results["operator"]
     found = []
+    if links["lost_braked"] != links["lost"]:
+        found.append(f"cut off from the hub, {links['lost_braked']} of {links['lost']} rovers were braked")
+    if links["others_braked"]:
+        found.append(f"{links['others_braked']} rovers were braked whose links were not cut")
     if hub["braked"] != rovers:
         found.append(f"without the hub, {hub['braked']} of {rovers} rovers were braked")
     if operator["braked"] != operator["his_rovers"]:
@@ -44,7 +48,7 @@ def wrong(results: Figures, rovers: int) -> list[str]:
 
 
 def report(results: Figures) -> str:
-    one, whole, hub, operator = (results[name] for name in ("one", "all", "hub", "operator"))
+    one, whole, hub, links, operator = (results[name] for name in ("one", "all", "hub", "links", "operator"))
     ratio = whole["hub_cpu_us_per_message"] / one["hub_cpu_us_per_message"]
     lines = [f"{'rovers':38}{one['rovers']:>10}{whole['rovers']:>10}"]
     for label, path in ROWS.items():
@@ -56,6 +60,11 @@ def report(results: Figures) -> str:
         f"without the hub: {hub['braked']} of {hub['rovers']} rovers braked; {_shown(hub, 'brake_after_ms')}",
         f"hub back: driven again; {_shown(hub, 'driven_again_after_ms')}",
         f"hub back: heard again; {_shown(hub, 'heard_again_after_ms')}",
+        f"links cut: {links['lost_braked']} of {links['lost']} rovers braked; {_shown(links, 'brake_after_ms')}",
+        f"links cut: {links['others_braked']} of {links['others']} others braked; between commands, "
+        + _shown(links, "others_gap_ms"),
+        f"links back: driven again; {_shown(links, 'driven_again_after_ms')}",
+        f"hub with cut links: {links['hub']['threads']} threads, {links['hub']['descriptors']} descriptors",
         f"an operator less: {operator['braked']} of his {operator['his_rovers']} rovers braked; "
         + _shown(operator, "brake_after_ms"),
         f"an operator less: {operator['others_braked']} of {operator['other_rovers']} others braked; between commands, "

@@ -31,13 +31,8 @@ PATIENCE = 120.0
 AT_ONCE = 4
 """Routers that start together."""
 
-HUB = """\
-import signal, zenoh
-hub = zenoh.open(zenoh.Config.from_file("hub.json5"))
-print(flush=True)
-signal.pause()
-"""
-"""The guide's, which says when it takes connections."""
+CUT_OFF = "127.0.4."
+"""Network of the addresses from which routers connect to the hub; the last number is the rover's."""
 
 PROTO = """\
 syntax = "proto3";
@@ -89,7 +84,8 @@ GATEWAY = """\
 def table() -> str:
     """One table for all rovers: the guide's gateway below routes of two messages."""
     gateways = written(PAGE)["rover.yaml"].partition("gateways:\n")[2].partition("    inbound:\n")[0]
-    return f"{TABLE}gateways:\n{gateways}{GATEWAY}"
+    hub = "tls/127.0.0.1:7447"
+    return f"{TABLE}gateways:\n{gateways}{GATEWAY}".replace(hub, f'"{hub}#bind={CUT_OFF}${{NUMBER}}:0"')
 
 
 class Fleet:
@@ -118,6 +114,8 @@ class Fleet:
         drivers = {f"rover_{rover}": [f"operator_{operator}"] for rover, operator in self.drivers.items()}
         program = re.sub(r"^DRIVERS = .*$", f"DRIVERS = {drivers}", written(PAGE)["fleet.py"], flags=re.MULTILINE)
         (self.folder / "fleet.py").write_text(program)
+        is_open = "print('open', flush=True)"
+        (self.folder / "hub.py").write_text(written(PAGE)["hub.py"].replace("signal.pause()", f"{is_open}\nsignal.pause()"))
         names = " ".join(["hub", *drivers, *(f"operator_{number}" for number in set(self.drivers.values()))])
         for command in (command for command in typed(PAGE) if "openssl" in command):
             made = re.sub(r"in hub .*? ben;", f"in {names};", command)
@@ -125,11 +123,15 @@ class Fleet:
         subprocess.run([sys.executable, "fleet.py"], cwd=self.folder, check=True)
 
     def start_hub(self) -> None:
-        """Return when it takes connections."""
-        self.hub = subprocess.Popen([sys.executable, "-c", HUB], cwd=self.folder, stdout=subprocess.PIPE)
+        """Start the hub by the guide's command. Return when it takes connections."""
+        [command] = [command.removesuffix(" &") for command in typed(PAGE) if "python hub.py" in command]
+        environment, _, _ = command.partition("python")
+        log = self.folder / "hub.log"
+        log.unlink(missing_ok=True)
+        shell = f"{environment} exec {sys.executable} hub.py >{log.name} 2>&1"
+        self.hub = subprocess.Popen(["/bin/sh", "-c", shell], cwd=self.folder)
         self._opened.callback(end, self.hub)
-        if self.hub.stdout is None or not self.hub.stdout.readline():
-            raise SystemExit("the hub did not start")
+        wait_until(lambda: log.exists() and "open\n" in log.read_text(), "the hub")
 
     def start(self, rovers: Sequence[int]) -> None:
         """Start routers, a few at a time, and the operators that they need; return when every gateway serves."""
@@ -159,6 +161,16 @@ class Fleet:
             running = subprocess.Popen(command, cwd=self.folder, env=environment, stderr=log)
         self.routers[rover] = running
         self._opened.callback(end, running)
+
+    def cut(self, rovers: Sequence[int]) -> None:
+        """Drop all packets between these rovers and the hub, in both directions, until `mend`."""
+        addresses = ", ".join(f"{CUT_OFF}{rover}" for rover in rovers)
+        chain = "type filter hook output priority 0;"
+        rules = f"ip saddr {{ {addresses} }} drop; ip daddr {{ {addresses} }} drop;"
+        subprocess.run(["nft", f"table ip cut {{ chain cut {{ {chain} {rules} }}; }}"], check=True)
+
+    def mend(self) -> None:
+        subprocess.run(["nft", "delete table ip cut"], check=True)
 
     def _serves(self, rover: int) -> bool:
         if self.routers[rover].poll() is not None:
@@ -229,6 +241,11 @@ def cpu_ns(pid: int) -> int:
     """Of all living threads."""
     tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
     return sum(int(task.read_text().split()[0]) for task in tasks)
+
+
+def entries(pid: int, kind: str) -> int:
+    """The number of threads (`task`) or open files (`fd`)."""
+    return len(list(Path(f"/proc/{pid}/{kind}").iterdir()))
 
 
 def memory(pid: int) -> Mapping[str, float]:

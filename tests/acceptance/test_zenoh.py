@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
 
@@ -47,6 +48,24 @@ DRIVE = {"/drive_motor": "comms/msg/DrivingBoardMotorMessage"}
 MOVE = ("/drive_motor", {"distance_to_go": 1.0, "turning_radius": 0.0})
 
 
+CA = """\
+[ca]
+default_ca = here
+[here]
+new_certs_dir = new
+database = index
+rand_serial = yes
+certificate = ../ca.pem
+private_key = ../ca.key
+default_md = sha256
+policy = names
+copy_extensions = copy
+[names]
+commonName = supplied
+"""
+"""For `openssl ca`, which signs for seconds."""
+
+
 @dataclass(frozen=True)
 class Fleet:
     """What the commands of docs/guides/fleet.md make in a folder: certificates, and configurations of Zenoh."""
@@ -62,9 +81,10 @@ class Fleet:
     @contextmanager
     def hub(self) -> Iterator[subprocess.Popen[bytes]]:
         """The hub, by the page's command. Gateways and operators wait for it."""
-        [command] = [command for command in typed(PAGE) if command.startswith("python -c ")]
-        python = command.removeprefix("python").removesuffix(" &")
-        running = subprocess.Popen(["/bin/sh", "-c", f"exec {sys.executable}{python}"], cwd=self.folder)
+        [command] = [command for command in typed(PAGE) if "python hub.py" in command]
+        environment, _, rest = command.removesuffix(" &").partition("python")
+        shell = f"{environment} exec {sys.executable}{rest}"
+        running = subprocess.Popen(["/bin/sh", "-c", shell], cwd=self.folder)
         try:
             yield running
         finally:
@@ -80,6 +100,18 @@ class Fleet:
         with zenoh.open(config) as session:
             yield session
 
+    def sign_for(self, name: str, seconds: int) -> str:
+        """Give `name` a certificate that is valid for that long. Return its folder, for `operator`."""
+        place = self.folder / "short"
+        (place / "new").mkdir(parents=True)
+        (place / "index").touch()
+        (place / "ca.cnf").write_text(CA)
+        until = datetime.now(timezone.utc) + timedelta(seconds=seconds)
+        sign = f"openssl ca -batch -config ca.cnf -in ../{name}.csr -out {name}.pem -enddate {until:%Y%m%d%H%M%SZ}"
+        command = f"{sign} && cp ../{name}.key ."
+        subprocess.run(["/bin/sh", "-e", "-c", command], cwd=place, check=True, capture_output=True)
+        return "/short"
+
     def drive(self, name: str, rover: str) -> None:
         """The page's program, to its end."""
         words = [sys.executable, "drive.py", f"{name}.json5", rover]
@@ -92,7 +124,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
     made = Fleet(tmp_path_factory.mktemp("fleet"), free_port(kind=socket.SOCK_STREAM))
-    for name in ("fleet.py", "drive.py"):
+    for name in ("fleet.py", "hub.py", "drive.py"):
         (made.folder / name).write_text(written(PAGE)[name].replace("7447", str(made.port)))
     certificates = [command for command in typed(PAGE) if "openssl" in command]
     for place in (made.folder, made.folder / "others"):
@@ -222,6 +254,36 @@ def test_who_has_no_certificate_of_the_authority_does_not_get_in(fleet: Fleet, s
         config.insert_json5("transport/link/tls/root_ca_certificate", f'"{fleet.folder}/ca.pem"')
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(config)
+
+
+def test_an_operator_whose_certificate_expires_while_driving_drives_no_longer(fleet: Fleet) -> None:
+    with fleet.hub(), fleet.operator("rover_1") as rover:
+        commands = Heard(rover, f"{MINE}/inbound/**")
+        with fleet.operator("ann", fleet.sign_for("ann", 15)) as ann:
+            commands.await_one(lambda: ann.put(f"{MINE}/inbound/drive_motor", "go"), count=3)
+            with repeating(lambda: ann.put(f"{MINE}/inbound/drive_motor", "go")):
+                wait_until(lambda: not ann.info.routers_zid(), "the end of the link")
+                driven = len(commands.payloads())
+                time.sleep(3.0)  # Zenoh tries again after 1 s and 2 s
+                assert len(commands.payloads()) == driven
+    log = (fleet.folder / "hub.log").read_text()
+    assert "remote certificate chain expired" in log
+    assert "certificate expired" in log  # what the hub said of each further attempt
+
+
+def test_the_hub_drops_what_is_too_large(fleet: Fleet) -> None:
+    with fleet.hub(), fleet.operator("rover_1") as rover, fleet.operator("ann") as ann:
+        commands, data = Heard(rover, f"{MINE}/inbound/**"), Heard(ann, f"{MINE}/data/**")
+
+        def send() -> None:
+            for session, key in ((ann, f"{MINE}/inbound/drive_motor"), (rover, f"{MINE}/data/picture")):
+                session.put(key, "x" * 70_000)
+                session.put(key, "x")
+
+        for heard in (commands, data):
+            heard.await_one(send, count=4)
+        assert {*map(len, commands.payloads())} == {1}
+        assert {*map(len, data.payloads())} == {1, 70_000}
 
 
 def test_rovers_and_operators_find_a_hub_that_comes_back(
