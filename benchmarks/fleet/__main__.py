@@ -202,6 +202,8 @@ def without_hub(fleet: Fleet, rovers: Sequence[int]) -> Figures:
 
 def without_links(fleet: Fleet, rovers: Sequence[int]) -> Figures:
     """Half of the rovers are cut off from the hub for a while."""
+    flow(fleet, rovers)
+    await_flow(fleet, rovers)
     time.sleep(2 * DRAIN)
     take(fleet)
     lost, others = rovers[::2], rovers[1::2]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -15,7 +17,7 @@ from structlog.testing import capture_logs
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.clock import boottime_ns
-from router.gateway import packets
+from router.gateway import packets, subscriptions
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.stage import Graph, Stage, program
 
@@ -91,6 +93,38 @@ async def test_topics_beyond_the_limit_are_named_and_not_subscribed_and_a_named_
         graph.topics = {"/wanted": STRING}
         await until(lambda: stage.count("gateway_topics", "it", "served") == 1)
         assert stage.count("gateway_topics", "it", "over_limit") == 0
+
+
+@asynchronous
+async def test_memory_is_returned_once_after_many_topics_have_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    returned: list[int] = []
+    graph = Graph({f"/stranger/{number}": STRING for number in range(150)})
+    monkeypatch.setattr(subscriptions, "RETURN_S", 0.2)
+    monkeypatch.setattr(subscriptions, "return_freed_memory", lambda: returned.append(len(graph.topics)))
+    async with Stage(program(tmp_path, f"it: {{{TCP}}}"), graph) as stage:
+        await stage.played["it"].start()
+        await until(lambda: stage.count("gateway_topics", "it", "served") == 150)
+        graph.topics.clear()
+        await until(lambda: returned)
+        await asyncio.sleep(0.3)
+        assert returned == [0]
+
+
+def test_freed_memory_between_blocks_in_use_is_returned() -> None:
+    script = """
+from router.gateway.subscriptions import return_freed_memory
+from tests.gateway.transport_events import resident_kib
+before = resident_kib()
+blocks = [bytes(2000) for _ in range(50_000)]
+kept = blocks[::100]
+del blocks
+held = resident_kib() - before
+return_freed_memory()
+assert held > 80_000 > 20_000 > resident_kib() - before, (held, resident_kib() - before)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
 
 
 @asynchronous
