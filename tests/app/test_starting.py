@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from itertools import dropwhile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -85,7 +86,7 @@ def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> list[st
     return [json.loads(line)["event"] for line in log.splitlines()]
 
 
-def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path, **options: object) -> subprocess.Popen[str]:
+def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path, **options: Any) -> subprocess.Popen[str]:
     """Before it imports anything that takes long. It goes on after a line."""
     folder = tmp_path / "halting"
     folder.mkdir()

@@ -210,12 +210,12 @@ async def test_an_address_that_this_machine_does_not_have_yet_is_waited_for(monk
 def test_a_packet_larger_than_the_paths_mtu_arrives_though_icmp_is_filtered() -> None:
     async def serve() -> bytes:
         events = Events()
-        async with opened(UdpTransport(address_of(headset), None, events)):
+        async with opened(UdpTransport(address_of(hearer), None, events)):
             [client] = events.clients
             client.write([data(bytes(1400))])
-            return (await hear(headset))[0]
+            return (await hear(hearer))[0]
 
-    with narrow_path() as (near, far), far.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as headset:
-        headset.bind(("10.78.2.2", 9000))
-        headset.settimeout(10)
+    with narrow_path() as (near, far), far.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as hearer:
+        hearer.bind(("10.78.2.2", 9000))
+        hearer.settimeout(10)
         assert near.inside(lambda: asyncio.run(serve())) == bytes(1400)

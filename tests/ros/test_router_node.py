@@ -19,7 +19,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-import std_msgs  # type: ignore[import-untyped]
+import std_msgs
 from rclpy.duration import Duration
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from structlog.testing import capture_logs
