@@ -114,8 +114,8 @@ class Fleet:
         drivers = {f"rover_{rover}": [f"operator_{operator}"] for rover, operator in self.drivers.items()}
         program = re.sub(r"^DRIVERS = .*$", f"DRIVERS = {drivers}", written(PAGE)["fleet.py"], flags=re.MULTILINE)
         (self.folder / "fleet.py").write_text(program)
-        is_open = "print('open', flush=True)"
-        (self.folder / "hub.py").write_text(written(PAGE)["hub.py"].replace("signal.pause()", f"{is_open}\nsignal.pause()"))
+        hub = written(PAGE)["hub.py"].replace("signal.pause()", "print('open', flush=True)\nsignal.pause()")
+        (self.folder / "hub.py").write_text(hub)
         names = " ".join(["hub", *drivers, *(f"operator_{number}" for number in set(self.drivers.values()))])
         for command in (command for command in typed(PAGE) if "openssl" in command):
             made = re.sub(r"in hub .*? ben;", f"in {names};", command)
@@ -167,10 +167,10 @@ class Fleet:
         addresses = ", ".join(f"{CUT_OFF}{rover}" for rover in rovers)
         chain = "type filter hook output priority 0;"
         rules = f"ip saddr {{ {addresses} }} drop; ip daddr {{ {addresses} }} drop;"
-        subprocess.run(["nft", f"table ip cut {{ chain cut {{ {chain} {rules} }}; }}"], check=True)
+        filter_packets(f"table ip cut {{ chain cut {{ {chain} {rules} }}; }}")
 
     def mend(self) -> None:
-        subprocess.run(["nft", "delete table ip cut"], check=True)
+        filter_packets("delete table ip cut")
 
     def _serves(self, rover: int) -> bool:
         if self.routers[rover].poll() is not None:
@@ -182,6 +182,10 @@ class Fleet:
 
     def scrape(self, rover: int) -> Snapshot:
         return metrics(f"http://127.0.1.{rover}:9108")
+
+
+def filter_packets(command: str) -> None:
+    subprocess.run(["nft", command], check=True)  # noqa: S607
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

@@ -133,7 +133,8 @@ class Topics:
             elif served.period == EACH:
                 self._sender.count_missed(served)
         served_as = ("several_types" if served.selection.others else "served" for served in self._served.values())
-        self._counters.topics(Counter(chain(served_as, self._not_served.values(), repeat("over_limit", len(over_limit)))))
+        states = Counter(chain(served_as, self._not_served.values()))
+        self._counters.topics({**states, "over_limit": len(over_limit)})
         self._log_over_limit(over_limit)
 
     def _rank(self, topic: str) -> int | None:
