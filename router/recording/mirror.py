@@ -99,7 +99,7 @@ class Source(Protocol):
 
 
 class Mirror:
-    """One thread calls the consumers, at most PERIOD after a datagram or an action; they must return quickly.
+    """Calls the consumers, one call at a time, at most PERIOD after a datagram or an action; they must return quickly.
 
     Exceptions of consumers go to `failed`.
     """
@@ -109,6 +109,7 @@ class Mirror:
         self._failed = failed
         self._consumers: tuple[tuple[Consumer, ActionConsumer | None], ...] = ()
         self._attaching = threading.Lock()
+        self._delivering = threading.Lock()
         self._stopping = threading.Event()
         self._thread: Thread | None = None
 
@@ -162,23 +163,24 @@ class Mirror:
         assert self._thread is not None  # noqa: S101 - there is one while there are consumers
         self._stopping.set()
         if join_or_abandon(self._thread):
-            self._deliver()
+            self.deliver()
 
     def _run(self, stopping: threading.Event) -> None:
         while not stopping.wait(PERIOD):
-            self._deliver()
+            self.deliver()
 
-    def _deliver(self) -> None:
-        """Call the consumers. Runs in the thread, and after its end in the one that joined it; never concurrently."""
-        actions, batch = self._source.take_actions(), self._source.take()
-        for consumer, acted in self._consumers:
-            try:
-                if batch:
-                    consumer(batch)
-                if actions and acted is not None:
-                    acted(actions)
-            except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
-                self._failed(error)
+    def deliver(self) -> None:
+        """Call the consumers with what was mirrored until now. Thread-safe."""
+        with self._delivering:
+            actions, batch = self._source.take_actions(), self._source.take()
+            for consumer, acted in self._consumers:
+                try:
+                    if batch:
+                        consumer(batch)
+                    if actions and acted is not None:
+                        acted(actions)
+                except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
+                    self._failed(error)
 
 
 class Classifier:

@@ -96,6 +96,7 @@ class Recorder:
     """
 
     def __init__(self, mirror: Mirror, program: Callable[[], Program], settings: RecordSettings) -> None:
+        self._mirror = mirror
         self._running_program = program
         self._settings = settings
         self._program = program()
@@ -128,9 +129,13 @@ class Recorder:
         self._detach = mirror.attach(self._take, self._take_actions)
 
     def save(self, reason: str) -> Path:
-        """Write the datagrams in memory to a new file, and return its path. Thread-safe. Raises RecordError."""
+        """Write all datagrams until now that are in memory to a new file, and return its path. Thread-safe.
+
+        Raises RecordError.
+        """
         if self._ring is None:
             raise RecordError("nothing is kept in memory: give the table's `record` a `last`")
+        self._mirror.deliver()
         done: Future[Path] = Future()
         with self._requesting:
             if self._closing:

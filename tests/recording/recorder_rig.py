@@ -156,6 +156,9 @@ class FakeMirror:
         self.show, self.act = consumer, acted
         return lambda: None
 
+    def deliver(self) -> None:
+        """Nothing waits."""
+
 
 def recorder(mirror: FakeMirror, settings: RecordSettings) -> Recorder:
     return Recorder(cast("Mirror", mirror), lambda: cast("Program", mirror.program), settings)
