@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
+from router.recording import mirror
 from router.recording.mirror import Acted, Consumer, Mirror, Mirrored, MirroredDatagram
 
 PEER = ("127.0.0.2", 8)
@@ -61,6 +62,16 @@ def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> 
     assert [each.data for each in seen] == [b"0", b"1", b"2"]
     assert {(each.listener, each.peer, each.endpoint, each.reason) for each in seen} == {("rover", PEER, "board", "")}
     assert source.mirror.lost == 7
+
+
+def test_what_waits_is_delivered_at_once_on_demand(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror, "PERIOD", 60.0)
+    got: list[Mirrored] = []
+    detach = source.mirror.attach(got.extend)
+    source.receive(b"1")
+    source.mirror.deliver()
+    assert [data for *_, data in got] == [b"1"]
+    detach()
 
 
 def test_the_source_is_told_when_the_first_comes_and_the_last_goes(source: Source) -> None:
