@@ -50,8 +50,8 @@ static const struct route only = {
     .last_message = LAST_MESSAGE, .duration = DURATION};
 static const struct peer peers[] = {
     {.address = 1, .port = 7, .last_seen = SEEN, .heard_since = HEARD, .silences = SILENCES, .last_silence = SILENCE},
-    {.address = 1, .column = 1, .last_seen = SEEN, .id = 1, .pause = INT64_MAX},
-    {.address = 2, .port = 9, .column = 1, .last_seen = SEEN, .id = 1, .pause = INT64_MAX}};
+    {.address = 1, .column = 1, .last_seen = SEEN, .heard_since = HEARD, .id = 1, .pause = INT64_MAX},
+    {.address = 2, .port = 9, .column = 1, .last_seen = SEEN, .heard_since = HEARD, .id = 1, .pause = INT64_MAX}};
 static const struct choice choices[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];
 static struct listener listeners[LISTENERS];

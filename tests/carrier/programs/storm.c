@@ -25,7 +25,7 @@ enum {
     LISTENER_COUNTERS = 0,
     ROUTE_COUNTERS = LISTENER_COUNTERS + LISTENERS * OF_LISTENER,
     OTHER_COUNTERS = ROUTE_COUNTERS + ROUTES * (OF_ROUTE + 1),
-    UNKNOWN = OTHER_COUNTERS, UNHANDLED_CASE, SEEN, MIRROR_LOST, COUNTERS
+    UNKNOWN = OTHER_COUNTERS, UNHANDLED_CASE, SEEN, HEARD, MIRROR_LOST, COUNTERS
 };
 enum { ACTIVE, TRIPS, BRAKES, BRAKE_ERRORS, DEADMAN_COUNTERS };
 
@@ -167,7 +167,7 @@ static struct made *make(uint32_t generation) {
     made->feed.deadman = open_deadman();
     made->layout = (struct layout){.sections = &made->section, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
     made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
-    made->peer = (struct peer){.address = 0x7f000002, .last_seen = SEEN, .pause = INT64_MAX};
+    made->peer = (struct peer){.address = 0x7f000002, .last_seen = SEEN, .heard_since = HEARD, .pause = INT64_MAX};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};
     for (int index = 0; index < ROUTES; index++) make_route(made, index);
     made->program = (struct program){.generation = generation, .listener_count = 1 + generation % LISTENERS,
