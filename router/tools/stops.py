@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router.datagrams import Wire
+from router.errors import plural
 from router.observe.health import REMEDIES
 from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
@@ -48,7 +49,8 @@ class Tally:
         """What happened: `5 manual_drive from basestation were rejected: source_mismatch`."""
         source = f" from {self.sender}" if self.sender else ""
         verb = "was" if self.count == 1 else "were"
-        return f"{self.count} {self.case or 'datagrams'}{source} {verb} {self.decision}: {self.reason}"
+        what = f"{self.count} {self.case}" if self.case else plural(self.count, "datagram")
+        return f"{what}{source} {verb} {self.decision}: {self.reason}"
 
     def __str__(self) -> str:
         times = _clock(self.first) if self.count == 1 else f"{_clock(self.first)} to {_clock(self.last)}"
@@ -273,8 +275,8 @@ class Stops:
             self._commands.setdefault(case, {})[sender] = it.at
             return
         for name, state in self._states.items():
-            route = self._routes[name]
-            if not route.is_from_ros and (case == route.case or (not case and sender in route.sources)):
+            route = self._routes.get(name)  # none for a gateway's client
+            if route and not route.is_from_ros and (case == route.case or (not case and sender in route.sources)):
                 state.tally("rejected", it.reason, case, sender, is_own=sender in route.sources).add(it.at)
 
     def _did(self, it: Action) -> None:
@@ -289,7 +291,8 @@ class Stops:
             state.lost = {}
         elif it.what == LOST:
             sender = f"topic {it.topic}" if it.topic else self._sender(it.route)
-            state.tally("dropped", it.reason, self._routes[it.route].case, sender, is_own=True).add(it.at, it.detail)
+            case = self._routes.get(it.route, _UNKNOWN).case
+            state.tally("dropped", it.reason, case, sender, is_own=True).add(it.at, it.detail)
         elif it.what == TRIPPED:
             self._tripped(it, state)
         elif it.what == RELEASED and state.stop is not None:

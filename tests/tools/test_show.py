@@ -292,6 +292,23 @@ def test_the_deadman_of_a_gateways_client_tells_when_a_client_fed_it(
     assert said(capsys, path)[0] == f"16:02:30.000+0200 the deadman of {route} was fed by a client's message"
 
 
+def test_losses_are_told_beside_deadmen_that_the_metadata_does_not_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of gateways' clients, and all if a tool left the metadata out."""
+    rejected = got(0.1, DRIVE, "sensor_board", "source_mismatch")
+    path = recording(tmp_path, *stopped(0, "dashboard:/cmd_vel"), rejected, *stopped(0.5))
+    assert [line for line in explained(capsys, path) if "lost" in line] == [
+        "  lost      1 manual_drive from sensor_board was rejected: source_mismatch, 16:02:30.100"
+    ]
+    lost = did(0.3, LOST, target="driving_board", reason="stale")
+    (tmp_path / "without").mkdir()
+    path = recording(tmp_path / "without", *stopped(0), rejected, lost, *stopped(0.5), routes={})
+    assert [line for line in explained(capsys, path) if "lost" in line] == [
+        "  lost      1 datagram was dropped: stale, 16:02:30.300"
+    ]
+
+
 def test_only_the_stops_around_a_time_are_explained_and_their_absence_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
