@@ -309,7 +309,7 @@ class FoxgloveServer:
         return _View(program, Classifier(program.envelope, program.table), channels)
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
-        """Send the accepted payloads of subscribed channels. Called by the mirror's thread."""
+        """Send the accepted payloads of subscribed channels. Called by the mirror."""
         program, classifier, channels = self._view
         numbers = {name: case.number for name, case in program.envelope.cases.items()}
         known = frozenset(numbers.values())
@@ -345,9 +345,16 @@ def _subscriptions(text: str) -> tuple[Mapping[int, int], Collection[int]]:
         request = json.loads(text)
         added = request["subscriptions"] if request["op"] == "subscribe" else ()
         gone = request["subscriptionIds"] if request["op"] == "unsubscribe" else ()
-        return {each["channelId"]: _NUMBERS.index(each["id"]) for each in added}, set(gone)
+        return {each["channelId"]: _number(each["id"]) for each in added}, set(gone)
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise _BadRequestError from error
+
+
+def _number(value: object) -> int:
+    """Return the number of a subscription. Raises ValueError."""
+    if not isinstance(value, int) or value not in _NUMBERS:  # a range is searched for anything but an integer
+        raise ValueError(value)
+    return value
 
 
 class _Connection(ServerConnection):

@@ -349,6 +349,8 @@ def test_clients_outside_the_networks_are_refused_and_counted(router: Showing, m
         "[]",
         '{"op": "subscribe"}',
         '{"op": "subscribe", "subscriptions": [7]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 0.5, "channelId": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 4294967296, "channelId": 1}]}',
         '{"op": "unsubscribe", "subscriptionIds": [[]]}',
         "[" * 60_000,
     ],
