@@ -65,8 +65,8 @@ class LastValues:
             self._end()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Remember the newest datagrams. Called by the mirror's thread."""
-        now, numbers = boottime_ns(), self._running.program.envelope.numbers.values()
+        """Remember the newest datagrams. Called by the mirror."""
+        now, numbers = boottime_ns(), frozenset(self._running.program.envelope.numbers.values())
         with self._newest_lock:
             for datagram in batch:
                 *_, reason, data = datagram
