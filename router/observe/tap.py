@@ -141,12 +141,12 @@ class Tap:
             self._changed.notify()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Queue the wanted datagrams. Called by the mirror's thread."""
+        """Queue the wanted datagrams. Called by the mirror."""
         chosen = batch if self._is_wanted is None else list(filter(self._is_wanted, batch))
         self._queue(encode(chosen), len(chosen))
 
     def _take_actions(self, actions: Sequence[Acted]) -> None:
-        """Queue the actions. Called by the mirror's thread."""
+        """Queue the actions. Called by the mirror."""
         self._queue(encode_actions(actions), len(actions))
 
     def _queue(self, piece: bytes, count: int) -> None:

@@ -1,6 +1,6 @@
 """The recorder: writes datagrams and actions of the mirror to disk, and keeps the newest in memory to save on request.
 
-The mirror's thread encodes each datagram once, into chunks for both; the thread `recorder` writes them.
+Each datagram is encoded once when the mirror delivers it, into chunks for both; the thread `recorder` writes them.
 """
 
 from __future__ import annotations
@@ -200,11 +200,11 @@ class Recorder:
             self._wake_up.set()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Encode a batch. Called by the mirror's thread."""
+        """Encode a batch. Called by the mirror."""
         self._encode(self._encoder.add, batch)
 
     def _take_actions(self, actions: Sequence[Acted]) -> None:
-        """Encode actions. Called by the mirror's thread."""
+        """Encode actions. Called by the mirror."""
         self._encode(self._encoder.add_actions, actions)
 
     def _encode(self, add: Callable[[Sequence[Any], Classifier, int, int], None], batch: Sequence[Any]) -> None:

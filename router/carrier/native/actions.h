@@ -1,6 +1,6 @@
 /* The actions of the router, for observers: the commands that it sends, the datagrams of deadmen, messages lost on the way to
- * an endpoint, changes of deadmen, and the ends of silences. Received datagrams have a ring of their own (carrier.h), so a flood of them displaces
- * no action.
+ * an endpoint, changes of deadmen, and the ends of silences. Received datagrams have a ring of their own (carrier.h), so a
+ * flood of them displaces no action.
  *
  * While nobody observes, an action costs one load. Any thread may note one; the lock is held only to copy a record. */
 #ifndef ACTIONS_H
