@@ -15,6 +15,7 @@ from router.shortage import is_shortage
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    import logging
     from types import ModuleType
     from typing import Any, TextIO
 
@@ -88,6 +89,22 @@ def _import_structlog() -> ModuleType:
     with left_out("rich"), postponed("asyncio"):
         import structlog
     return structlog
+
+
+def logger_of_library(name: str, library: str) -> logging.Logger:
+    """Return a logger for a library that logs what its clients do wrong, which seldom helps an operator: as debug."""
+    import logging
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            why = record.exc_info[1] if record.exc_info else None
+            logger.debug("message of a library", library=library, what=record.getMessage(), why=repr(why))
+
+    made = logging.getLogger(name)
+    made.setLevel(logging.WARNING)
+    made.propagate = False
+    made.addHandler(Handler())
+    return made
 
 
 def configure_log(level: str = "info", *, coloured: bool = False) -> None:

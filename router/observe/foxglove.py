@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
-import logging
 import socket
 import struct
 from collections import Counter, deque
@@ -29,7 +28,7 @@ from websockets.typing import Subprotocol
 
 from router.clock import wall_ns
 from router.compiler.program import Program
-from router.log import FloodLog, fault, logger
+from router.log import FloodLog, fault, logger_of_library
 from router.net.doors import Door, is_foreign
 from router.net.kernel import why_not_bound
 from router.observe.running import Running
@@ -403,13 +402,4 @@ def _listening(settings: ServerSettings) -> socket.socket:
         raise kind(what, "choose another foxglove.address") from error
 
 
-class _DebugLog(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        logger.debug("websockets library", what=record.getMessage())
-
-
-_LOG = logging.getLogger("router.foxglove")
-"""The library logs clients that violate the protocol, which seldom helps an operator."""
-_LOG.setLevel(logging.WARNING)
-_LOG.propagate = False
-_LOG.addHandler(_DebugLog())
+_LOG = logger_of_library("router.foxglove", "websockets")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import re
 import socket
 import struct
@@ -34,7 +33,7 @@ from router.gateway.transport.stream import (
     size_of,
     together,
 )
-from router.log import logger
+from router.log import logger_of_library
 from router.net.doors import Door, is_foreign
 from router.table.addresses import Address
 
@@ -223,14 +222,4 @@ def _serialized(opcode: Opcode, message: Sequence[Part]) -> Iterator[Sequence[Pa
         yield struct.pack(">BB", first, size) if size < 126 else struct.pack(">BBH", first, 126, size), *content
 
 
-class _DebugLog(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        why = record.exc_info[1] if record.exc_info else None
-        logger.debug("websockets library", what=record.getMessage(), why=repr(why))
-
-
-_LOG = logging.getLogger("router.websocket")
-"""The library logs clients that violate HTTP or disconnect early, which seldom helps an operator."""
-_LOG.setLevel(logging.WARNING)
-_LOG.propagate = False
-_LOG.addHandler(_DebugLog())
+_LOG = logger_of_library("router.websocket", "websockets")
