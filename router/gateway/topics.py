@@ -322,7 +322,9 @@ class Topics:
                 held = [each for each in queue.held_before(topic, frame.sent_ns) if each.sent_ns not in skipped]
                 skipped.update(each.sent_ns for each in held)
                 waiting += (*held, frame)
-        while waiting := waiting or [each for each in queue.held_before(topic, inf) if each.sent_ns not in known][:1]:
+        while waiting := waiting or _beginning(
+            each for each in queue.held_before(topic, inf) if each.sent_ns not in known
+        ):
             if not await self._write_when_drained(queue, waiting, until):
                 return False
             known.update(each.sent_ns for each in waiting)
@@ -392,3 +394,15 @@ class Topics:
             arrived = served.subscription.arrived
             yield topic, served.subscription.type_name, (arrived - served.reported) / seconds
             served.reported = arrived
+
+
+def _beginning(frames: Iterable[Frame]) -> list[Frame]:
+    """Return the first frames, at most LOW_WATER bytes but at least one frame."""
+    found: list[Frame] = []
+    size = 0
+    for frame in frames:
+        size += len(frame.data)
+        if found and size > LOW_WATER:
+            break
+        found.append(frame)
+    return found
