@@ -13,6 +13,8 @@ import struct
 _BACKLOG = 64
 _CREDENTIALS = struct.Struct("3i")
 """struct ucred of <sys/socket.h>: process, user, group."""
+_TIME = struct.Struct("2l")
+"""struct timeval of <sys/time.h>: seconds, microseconds."""
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -41,17 +43,20 @@ def _owners() -> tuple[int, ...]:
 def connect(host: str, port: int, patience: float | None) -> socket.socket:
     """Connect to the router of this computer that serves HTTP there. `host` is an IPv4 address. Raises OSError.
 
-    That router may serve all addresses of this computer.
+    That router may serve all addresses of this computer. Waits up to `patience` (s) while other users fill its queue.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((host, 0))  # otherwise another computer's address could mean this one's router
     connection = socket.socket(socket.AF_UNIX)
-    connection.settimeout(patience)
     try:
+        seconds = patience or 0.0  # 0: without limit
+        limit = _TIME.pack(int(seconds), int(seconds % 1 * 1e6))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)  # with Python's, a full queue is an error
         try:
             connection.connect(_name(host, port))
         except ConnectionRefusedError:
             connection.connect(_name("0.0.0.0", port))
+        connection.settimeout(patience)
     except BaseException:
         connection.close()
         raise
