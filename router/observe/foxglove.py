@@ -191,6 +191,7 @@ class FoxgloveServer:
         self._detach_from_mirror()
         self._server.close()
         await self._server.wait_closed()
+        await asyncio.wait([self._following])  # a task that has not ended when the loop stops is reported as a fault
 
     def _on_fault(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
