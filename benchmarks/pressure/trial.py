@@ -133,7 +133,7 @@ class Trial:
                 commander.result()
             after = metrics(place.metrics) if is_router else {}
             ended = receiver.stop()
-        arrivals = np.fromfile(log, dtype=traffic.ARRIVAL)
+        arrivals: Any = np.fromfile(log, dtype=traffic.ARRIVAL)
         result: Metrics = conditions | {"cpu_us": round(meter.cpu_ns / 1e3 / max(1, told["sent"] - meter.drops), 2)}
         result |= {"noise": round(meter.noise, 3), "generator_slips": told["slips"]}
         result |= self._forwarded(plan, sent, first, arrivals)

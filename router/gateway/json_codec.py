@@ -219,7 +219,7 @@ def _units(data: bytes) -> Any:
     """Return the UTF-16 units of a wstring, which stores each in 32 bits."""
     import numpy as np  # only few messages need it, and it takes 0.1 s and 20 MB
 
-    units = np.frombuffer(data, "<u4")
+    units: Any = np.frombuffer(data, "<u4")
     if len(units) and units.max() > _LARGEST_UNIT:
         raise UnreadableError("a wstring contains values above 0xFFFF, which are not UTF-16")
     return units
@@ -252,7 +252,7 @@ def _sequence(letter: str) -> Callable[[bytes], Any]:
             return struct.unpack(f"<{number}{letter}", data)
         import numpy as np  # as in _units
 
-        values = np.frombuffer(data, f"<{letter}" if letter != "?" else "u1")
+        values: Any = np.frombuffer(data, f"<{letter}" if letter != "?" else "u1")
         # orjson would write the shortest text of the float32, but clients read doubles.
         return _in_chunks(values.astype("<f8") if letter == "f" else values != 0 if letter == "?" else values)
 

@@ -169,9 +169,14 @@ class Mirror:
         while not stopping.wait(PERIOD):
             self.deliver()
 
-    def deliver(self) -> None:
-        """Call the consumers with what was mirrored until now. Thread-safe."""
-        with self._delivering:
+    def deliver(self, patience: float = -1) -> bool:
+        """Call the consumers with what was mirrored until now. Thread-safe.
+
+        Return False if another delivery takes longer than `patience` (s, or -1 for any time).
+        """
+        if not self._delivering.acquire(timeout=patience):
+            return False
+        try:
             actions, batch = self._source.take_actions(), self._source.take()
             for consumer, acted in self._consumers:
                 try:
@@ -181,6 +186,9 @@ class Mirror:
                         acted(actions)
                 except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
                     self._failed(error)
+        finally:
+            self._delivering.release()
+        return True
 
 
 class Classifier:

@@ -135,7 +135,8 @@ class Recorder:
         """
         if self._ring is None:
             raise RecordError("nothing is kept in memory: give the table's `record` a `last`")
-        self._mirror.deliver()
+        if not self._mirror.deliver(_PATIENCE):
+            raise RecordError("an observer of datagrams hangs")
         done: Future[Path] = Future()
         with self._requesting:
             if self._closing:

@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,7 +170,8 @@ def test_what_is_sent_straight_to_the_receiver_all_comes(tmp_path: Path) -> None
         subprocess.run([*map(str, sending)], check=True, stdout=subprocess.DEVNULL)
         receiver.send_signal(signal.SIGTERM)
         receiver.stdout.read()
-    sent, arrivals = np.fromfile(tmp_path / "sent", dtype="<i8"), np.fromfile(log, dtype=traffic.ARRIVAL)
+    sent: Any = np.fromfile(tmp_path / "sent", dtype="<i8")
+    arrivals: Any = np.fromfile(log, dtype=traffic.ARRIVAL)
     found = traffic.passage(sent, np.arange(200), 77, traffic.numbers(arrivals["head"]), arrivals["at"])
     assert (len(found.latency), found.lost, found.doubled) == (200, 0, 0)
     assert (found.latency >= 0).all()

@@ -156,8 +156,9 @@ class FakeMirror:
         self.show, self.act = consumer, acted
         return lambda: None
 
-    def deliver(self) -> None:
+    def deliver(self, patience: float) -> bool:
         """Nothing waits."""
+        return patience > 0
 
 
 def recorder(mirror: FakeMirror, settings: RecordSettings) -> Recorder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import threading
 from collections import deque
 from collections.abc import Sequence
 
@@ -69,8 +70,24 @@ def test_what_waits_is_delivered_at_once_on_demand(source: Source, monkeypatch: 
     got: list[Mirrored] = []
     detach = source.mirror.attach(got.extend)
     source.receive(b"1")
-    source.mirror.deliver()
+    assert source.mirror.deliver()
     assert [data for *_, data in got] == [b"1"]
+    detach()
+
+
+def test_who_waits_for_a_hung_consumer_is_told(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror, "PERIOD", 0.01)
+    hangs, may_go_on = threading.Event(), threading.Event()
+
+    def hang(_: Sequence[Mirrored]) -> None:
+        hangs.set()
+        may_go_on.wait(60)
+
+    detach = source.mirror.attach(hang)
+    source.receive(b"1")
+    assert hangs.wait(60)
+    assert not source.mirror.deliver(0.01)
+    may_go_on.set()
     detach()
 
 
