@@ -137,7 +137,7 @@ class FoxgloveServer:
         self._clients: dict[ServerConnection, _Client] = {}
         self._connections: dict[ServerConnection, str] = {}  # with their hosts, also before the handshake
         self._arrived: deque[_Message] = deque(maxlen=BACKLOG)
-        self._is_showing = False
+        self._is_showing = self._is_closing = False
         self._wanted: frozenset[int] = frozenset()
         self._detach: Callable[[], None] | None = None
         self._view = self._view_of(running.program)
@@ -187,11 +187,12 @@ class FoxgloveServer:
         self._log.flush(final=True)
 
     async def _close(self) -> None:
-        self._following.cancel()
+        self._is_closing = True
+        self._changed.set()
+        await self._following  # before Python 3.12, `wait_for` may ignore that it is cancelled
         self._detach_from_mirror()
         self._server.close()
         await self._server.wait_closed()
-        await asyncio.wait([self._following])  # a task that has not ended when the loop stops is reported as a fault
 
     def _on_fault(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
@@ -256,7 +257,7 @@ class FoxgloveServer:
     async def _follow(self) -> None:
         """Follow reloads and subscriptions."""
         is_well = True
-        while True:
+        while not self._is_closing:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), LOOK_SECONDS)
             self._changed.clear()
