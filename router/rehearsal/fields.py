@@ -195,17 +195,35 @@ class FieldReader:
                 return Fields(kind, {only.name: self._value(only.type, node, kind)}, node.span)
             case MessageType(), _:
                 return self.message(kind, node)
-            case List(), SequenceNode():
-                if kind.length is not None and len(node.items) != kind.length:
-                    message = f"{kind} has {kind.length} elements, not {len(node.items)}"
-                    raise invalid(node.span, Code.TYPE_MISMATCH, message)
-                return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
             case List(), _:
-                raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
+                return self._list(kind, node, holder)
             case _, ScalarNode():
                 return self._scalar(kind, node, holder)
         hint = "write the text itself" if is_text(node) else ""
         raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value", hint)
+
+    def _list(self, kind: List, node: Node, holder: MessageType) -> Elements:
+        if isinstance(node, SequenceNode):
+            if kind.length is not None and len(node.items) != kind.length:
+                message = f"{kind} has {kind.length} elements, not {len(node.items)}"
+                raise invalid(node.span, Code.TYPE_MISMATCH, message)
+            return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
+        if kind.entry is None:
+            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a list: write [a, b]")
+        if not isinstance(node, MappingNode):
+            raise invalid(node.span, Code.WRONG_TYPE, "this is a map: write {key: value}")
+        return self._entries(kind.entry, node)
+
+    def _entries(self, kind: MessageType, node: MappingNode) -> Elements:
+        """Read the entries of a protobuf map, written as `{key: value}`."""
+        key, value = kind.fields
+        read = [
+            (self._scalar(key.type, entry.key, kind), self._value(value.type, entry.value, kind))
+            for entry in node.entries.values()
+        ]
+        read.sort(key=lambda item: item[0].value)
+        items = (Fields(kind, {key.name: name, value.name: content}, name.span) for name, content in read)
+        return Elements(tuple(items), node.span)
 
     def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
         text = node.text

@@ -184,6 +184,17 @@ def test_every_kind_of_field_can_be_given_and_expected(tmp_path: Path) -> None:
     assert every_kind(tmp_path, "unchanged") == []
 
 
+def test_a_map_is_written_as_keys_and_values_in_any_order(tmp_path: Path) -> None:
+    expected = EVERY_KIND.replace("[{key: a, value: 1}, {key: b, value: 2}]", "{b: 2, a: 1}")
+    expected = expected.replace("[{key: 5, value: {x: 6}}]", "{5: {x: 6}}")
+    assert every_kind(tmp_path, expected) == []
+    assert every_kind(tmp_path, expected.replace("b: 2", "b: 3")) == ["right_tool: counts[1].value is 2, not 3"]
+    with pytest.raises(TableError, match="'five' is not an integer"):
+        every_kind(tmp_path, expected.replace("5: {", "five: {"))
+    with pytest.raises(TableError, match="this is a map"):
+        every_kind(tmp_path, expected.replace("{5: {x: 6}}", "7"))
+
+
 def test_every_kind_of_field_is_told_where_it_is_not_expected(tmp_path: Path) -> None:
     assert [
         said.removeprefix("right_tool: ").replace(", not at its default", "") for said in every_kind(tmp_path, "{}")
