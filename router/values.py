@@ -60,7 +60,11 @@ def _assign(message: Any, kind: MessageType, path: str, text: str) -> None:
         field, index = _step(kind, step, path)
         inner = _content(field.type)
         if not isinstance(inner, MessageType):
-            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, which has no fields")
+            here = ".".join(parents[: position + 1])
+            if index is None and isinstance(field.type, List) and field.type.entry is not None:
+                key = [*parents, last][position + 1]
+                raise UsageError(f"{here} is a map", f"name a value, such as {here}[{key}]=...")
+            raise UsageError(f"{here} of {kind.name} is {inner}, which has no fields")
         message = _inner_message(message, field, index, path)
         kind = inner
     field, index = _step(kind, last, path)

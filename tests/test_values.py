@@ -195,6 +195,7 @@ def test_a_map_is_set_by_its_keys() -> None:
     ("case", "word", "complaint"),
     [
         (PLAIN, "by_text=x", "by_text is a map; name a value, such as by_text[key]=..."),
+        (PLAIN, "by_text.left=x", "by_text is a map; name a value, such as by_text[left]=..."),
         (PLAIN, "by_i32.speed=1", "by_i32.speed: by_i32 is a map; name an element, such as by_i32[key].speed=..."),
         (PLAIN, "by_i32[left]=", "by_i32[left]: 'left' is not an integer (int32); write it as 42, -1 or 0x2a"),
         (PLAIN, 'by_text["\\q"]=1', """by_text["\\q"]: "\\q" is not a key: Invalid \\escape; quote it as in JSON"""),
