@@ -214,7 +214,11 @@ def _unbounded_finding(case: PayloadCase, found: Unbounded, schema: ProtoSchema,
     field = found.path[-1]
     path = ".".join((case.name, *(step.name for step in found.path)))
     place = schema.span(container(field).full_name, field.name)
-    is_overridden = "_override" in found.why
-    remedy = "remove that option" if is_overridden else "limit its size in a nanopb .options file beside the .proto"
-    hint = f"see {place}; {remedy}"
+    option = found.why.partition(" without a ")[2]
+    remedy = ""
+    if option:
+        remedy = f"; write `{field.full_name} {option}:N` into a nanopb .options file beside the .proto"
+    elif "_override" in found.why or "pointer or callback" in found.why:
+        remedy = "; remove that option"
+    hint = f"see {place}{remedy}"
     return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot decode {path}: it {found.why}", hint)
