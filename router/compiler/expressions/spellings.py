@@ -87,6 +87,9 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
             hint = f"write radians({value})" if unit in _DEGREES else hint
             hint = f"write {value} / 100 for a fraction" if unit == "%" else hint
             return Slip(found.span("unit"), f"'{unit}' is a unit, which expressions do not support", hint)
+    if every := _EVERY_ELEMENT.search(bare):
+        hint = f"without brackets, {every['list']} means every element; {every['list']}[0] is the first one"
+        return Slip(every.span("index"), f"'{every['index']}' names no element", hint)
     if sign := _WITHOUT_VALUE.search(bare):
         return Slip(sign.span("sign"), f"a value is missing after '{sign['sign']}'", "")
     return None
@@ -101,6 +104,7 @@ def _word_before(text: str) -> str:
 _DEGREES = ("degrees", "degree", "deg", "\u00b0")
 _SINGLE = "\u2018\u2019\u201a\u201b\u2032"
 _CURLY = re.compile(f"[{_SINGLE}\u201c-\u201f\u2033\u00ab\u00bb]")
+_EVERY_ELEMENT = re.compile(r"\b(?P<list>[A-Za-z_][\w.]*)(?P<index>\[\s*\*?\s*\])")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 
 NULLS = ("null", "nil", "none", "undefined", "nullptr")
