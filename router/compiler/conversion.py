@@ -138,7 +138,10 @@ def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, s
         given = same_named(value, member)
         members.append((member, _to_member(given, member, scope) if given else unset(member, value.span)))
     if target.fields and not any(source.field(member.name) for member in target.fields):
-        raise mismatch(value, target, "they have no field name in common")
+        names = {source.name, target.name}
+        is_time = names & STAMP_TYPES and names & DURATION_TYPES
+        hint = "one is a point in time, the other a duration" if is_time else "they have no field name in common"
+        raise mismatch(value, target, hint)
     return Record(target, tuple(members), value.span)
 
 

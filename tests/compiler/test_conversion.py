@@ -201,6 +201,14 @@ def test_auto_does_not_copy_from_a_group_beside_a_field_that_is_given() -> None:
     assert [finding.code for finding in found] == [FORBIDDEN]
 
 
+def test_a_time_and_a_duration_are_told_apart() -> None:
+    lapse = MessageType("google.protobuf.Duration", (Field("seconds", Int(64, True)), Field("nanos", Int(32, True))))
+    source = MessageType("Source", (Field("lapse", lapse), Field("point", POINT)))
+    declared = MessageType("m/msg/It", (Field("it", TIME),))
+    hints = [findings_of(field_map(it=text), declared, scope_of(source))[0].hint for text in ("lapse", "point")]
+    assert hints == ["one is a point in time, the other a duration", "they have no field name in common"]
+
+
 def test_refusal_says_what_to_do() -> None:
     declared = MessageType("m/msg/It", (Field("it", Int(8, False)),))
     hints = {
