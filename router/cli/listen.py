@@ -87,7 +87,11 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     scheme, separator, rest = args.place.partition("://")
     if not separator:
-        forms = f"udp://{scheme} (a gateway's packets), envelope://{scheme} (envelopes) or topic://{scheme} (a topic)"
+        forms = f"topic://{scheme.removeprefix('/')} (a topic)"
+        if scheme.rpartition(":")[2].isdecimal():
+            forms = f"envelope://{scheme} (envelopes), or udp://, tcp:// or ws://{scheme} (a gateway)"
+        elif not scheme.startswith("/"):
+            forms += f" or envelope://{scheme} (what an endpoint receives)"
         raise UsageError(f"'{scheme}' has no scheme", f"write {forms}")
     for name, (option, schemes) in _BELONGS_TO.items():
         if getattr(args, name) and scheme not in schemes:
