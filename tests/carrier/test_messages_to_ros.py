@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 from collections.abc import Callable
@@ -302,7 +303,8 @@ def test_hypot_differs_by_the_last_bit_at_most(delivering: CDLL) -> None:
             assert isinstance(found, bytes)
             assert expected.message is not None
             (bits,), (others,) = struct.unpack_from("<q", found, 4), struct.unpack_from("<q", expected.message, 4)
-            assert abs(bits - others) <= 1
+            is_nan = all(math.isnan(*struct.unpack_from("<d", each, 4)) for each in (found, expected.message))
+            assert is_nan or abs(bits - others) <= 1  # in Python 3.10, the sign of a NaN depends on the processor
 
     same()
 
