@@ -8,7 +8,6 @@ import runpy
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +28,7 @@ from router.types.ros import ros_interfaces
 from tests.docs_commands import file_name
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
+from tests.repeating import repeating
 from tests.tables import ROUTES
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -207,21 +207,14 @@ def test_the_client_shows_data_whose_schema_it_has(tmp_path: Path) -> None:
 @contextmanager
 def sent_again_and_again(packets: Sequence[bytes], port: int) -> Iterator[None]:
     """Send again and again, as a gateway does, because the client may not have started."""
-    ended = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
 
-    def send() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
-            while not ended.wait(0.05):
-                for packet in packets:
-                    gateway.sendto(packet, ("127.0.0.1", port))
+        def send() -> None:
+            for packet in packets:
+                gateway.sendto(packet, ("127.0.0.1", port))
 
-    sending = threading.Thread(target=send)
-    sending.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        sending.join()
+        with repeating(send, 0.05):
+            yield
 
 
 def test_the_udp_client_that_sends_sends_a_packet_that_the_gateway_reads(tmp_path: Path) -> None:

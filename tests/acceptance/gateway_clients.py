@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import struct
-import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -128,24 +127,6 @@ def lines(opened: socket.socket) -> Generator[dict[str, Any], None, None]:
     """The lines that a gateway with the format `json_lines` sends."""
     with opened.makefile("r", encoding="utf-8") as text:
         yield from map(json.loads, text)
-
-
-@contextmanager
-def repeating(action: Callable[[], object]) -> Iterator[None]:
-    """Publish repeatedly, because messages are lost until both sides of a topic have discovered each other."""
-    done = threading.Event()
-
-    def repeat() -> None:
-        while not done.wait(0.1):
-            action()
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
 
 
 @dataclass

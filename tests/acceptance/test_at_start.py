@@ -6,9 +6,9 @@ import json
 import signal
 import socket
 import subprocess
-import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
+from functools import partial
 from pathlib import Path
 from time import sleep
 
@@ -17,6 +17,7 @@ import pytest
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.site import BARE, RouterProcess, Site, key, site, total, udp, wait_until
 from tests.ports import free_port
+from tests.repeating import repeating
 
 TABLE = (
     BARE
@@ -63,21 +64,8 @@ def place(tmp_path: Path) -> Iterator[Site]:
         yield opened
 
 
-@contextmanager
-def commands_that_flow(place: Site) -> Iterator[None]:
-    ended = threading.Event()
-
-    def drive() -> None:
-        while not ended.wait(0.005):
-            place.send("basestation", DRIVE)
-
-    thread = threading.Thread(target=drive)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+def commands_that_flow(place: Site) -> AbstractContextManager[None]:
+    return repeating(partial(place.send, "basestation", DRIVE), 0.005)
 
 
 def kill(place: Site, router: RouterProcess) -> None:

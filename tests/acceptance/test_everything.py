@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import threading
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tests.acceptance.site import RouterProcess, Site, site, wait_until
 from tests.everything import odd, payload, unroutable, usual, wire
 from tests.observe.foxglove_client import FoxgloveClient
 from tests.ports import free_port
+from tests.repeating import repeating
 
 CASES = [*wire().envelope.cases]
 ACCEPTED = {**usual(), **odd()}
@@ -50,22 +51,9 @@ class Place:
         with urllib.request.urlopen(f"http://127.0.0.1:{self.site.metrics}{path}", timeout=PATIENCE) as answer:
             return json.loads(answer.read())
 
-    @contextmanager
-    def sending(self, *datagrams: bytes) -> Iterator[None]:
+    def sending(self, *datagrams: bytes) -> AbstractContextManager[None]:
         """Send these datagrams again and again."""
-        ended = threading.Event()
-
-        def send() -> None:
-            while not ended.wait(0.2):
-                self.site.send("source_tool", *datagrams)
-
-        thread = threading.Thread(target=send)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+        return repeating(partial(self.site.send, "source_tool", *datagrams), 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -162,18 +150,11 @@ def test_listen(options: Sequence[str], place: Place, said: Said) -> None:
     port = free_port()
 
     def send() -> None:
-        while not ended.wait(0.2):
-            for datagram in DATAGRAMS.values():
-                place.site.endpoints["source_tool"].sendto(datagram, ("127.0.0.1", port))
+        for datagram in DATAGRAMS.values():
+            place.site.endpoints["source_tool"].sendto(datagram, ("127.0.0.1", port))
 
-    ended = threading.Event()
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
+    with repeating(send, 0.2):
         assert said("listen", f"envelope://127.0.0.1:{port}", *options, "--count", 2 * len(DATAGRAMS))
-    finally:
-        ended.set()
-        thread.join()
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])

@@ -27,13 +27,13 @@ from tests.acceptance.gateway_clients import (
     head,
     lines,
     packet,
-    repeating,
     scene,
     twist,
 )
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import key, total, udp, wait_until
+from tests.repeating import repeating
 
 SHOWN = """\
     topics: {include: ["/gw/**"], exclude: ["/gw/secret/**"]}

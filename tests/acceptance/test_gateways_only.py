@@ -10,11 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from router.tools.running_router import post
-from tests.acceptance.gateway_clients import lines, repeating
+from tests.acceptance.gateway_clients import lines
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import RouterProcess, key, site, total, udp, wait_until
 from tests.ports import free_port
+from tests.repeating import repeating
 from tests.tables import PROTOS
 
 ONLY = """\

@@ -16,11 +16,11 @@ import pytest
 from websockets.sync.client import connect
 
 from router.ros.topics import TopicListener
-from tests.acceptance.gateway_clients import repeating
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import ROOT, RouterProcess, Site, key, udp, wait_until
 from tests.envelopes import rover_envelope
 from tests.ports import free_port
+from tests.repeating import repeating
 
 SENSOR_BOARD, DRIVING_BOARD, ROUTER = "127.0.0.30", "127.0.0.31", "127.0.0.5"
 

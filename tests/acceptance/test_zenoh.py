@@ -22,12 +22,13 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.acceptance.gateway_clients import Scene, repeating, scene
+from tests.acceptance.gateway_clients import Scene, scene
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import RouterProcess, key, wait_until
 from tests.docs_commands import typed, written
 from tests.ports import free_port
+from tests.repeating import repeating
 from tests.tables import PROTOS
 
 pytestmark = pytest.mark.slow  # discovery between three programs, with TLS

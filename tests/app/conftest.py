@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import time
@@ -19,6 +19,7 @@ from router.app import Router
 from router.compiler import check_table
 from router.compiler.program import Program
 from tests.ports import free_port
+from tests.repeating import repeating
 from tests.tables import PROTOS
 
 TABLE = """\
@@ -88,24 +89,15 @@ class Site:
         for datagram in datagrams:
             self.board.sendto(datagram, ("127.0.0.1", port or self.listen))
 
-    @contextmanager
-    def under_load(self) -> Iterator[None]:
+    def under_load(self) -> AbstractContextManager[None]:
         """Meanwhile send 2,000 numbered datagrams per second."""
-        ended = threading.Event()
 
         def load() -> None:
-            while not ended.wait(0.0005):
-                self.send(numbered(len(self.sent)))
-                self.sent.append(len(self.sent))
-                self.take()
+            self.send(numbered(len(self.sent)))
+            self.sent.append(len(self.sent))
+            self.take()
 
-        thread = threading.Thread(target=load)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+        return repeating(load, 0.0005)
 
     def take(self) -> None:
         """Receive the datagrams that have arrived."""

@@ -6,7 +6,6 @@ import ctypes
 import signal
 import socket
 import struct
-import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from time import sleep
@@ -19,6 +18,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from router.carrier.from_ros import FromRosThread
 from router.threads import StuckError
 from tests.app.conftest import BRAKE, Site
+from tests.repeating import repeating
 from tests.ros.peers import Publisher, wait_until
 from tests.tasks import thread_names
 
@@ -145,20 +145,14 @@ def test_a_topic_of_two_names_feeds_the_routes_of_both(site: Site, publisher: Pu
 @contextmanager
 def commands_coming(publisher: Publisher) -> Iterator[list[int]]:
     """Commands with their numbers come all the time; yields those that were published."""
-    ended, sent = threading.Event(), list[int]()
+    sent = list[int]()
 
     def publish() -> None:
-        while not ended.wait(0.001):
-            sent.append(len(sent) + 1)
-            publisher.publish([command(sent[-1])])
+        sent.append(len(sent) + 1)
+        publisher.publish([command(sent[-1])])
 
-    publishing = threading.Thread(target=publish)
-    publishing.start()
-    try:
+    with repeating(publish, 0.001):
         yield sent
-    finally:
-        ended.set()
-        publishing.join()
 
 
 def test_each_is_sent_once_and_in_order_while_subscriptions_take_over(site: Site, publisher: Publisher) -> None:

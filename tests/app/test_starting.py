@@ -11,9 +11,9 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.request
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from itertools import dropwhile
 from pathlib import Path
@@ -26,6 +26,7 @@ from router.errors import ConfigurationError, StartError
 from router.ros.environment import SHM, obstacles, unresolved_peers, uses_shared_memory
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
+from tests.repeating import repeating
 from tests.routers import MODULE, log_until_started, start
 from tests.tables import PROTOS, ROUTES
 
@@ -304,21 +305,12 @@ def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
 def test_it_stops_however_many_reloads_are_asked_for(table: Path) -> None:
     process = start(MODULE, "run", table)
     wait_for_start(process)
-    stopped = threading.Event()
-
-    def storm() -> None:
-        while not stopped.wait(0.001):
-            process.send_signal(signal.SIGHUP)
-
-    thread = threading.Thread(target=storm)
-    thread.start()
     try:
-        assert process.stderr
-        assert any('"table reloaded"' in line for line in process.stderr)
-        end(process)
+        with repeating(partial(process.send_signal, signal.SIGHUP), 0.001):
+            assert process.stderr
+            assert any('"table reloaded"' in line for line in process.stderr)
+            end(process)
     finally:
-        stopped.set()
-        thread.join()
         process.kill()
 
 
