@@ -26,8 +26,14 @@ class ReadyType:
     def __init__(self, message: MessageType, message_class: Any) -> None:
         self.message = message
         self.message_class = message_class
-        self.schemas = {style: schema_text(message, style) for style in Style}
+        self._schemas: dict[Style, str] = {}
         self._encoders: dict[Style, Encode] = {}
+
+    def schema(self, style: Style) -> str:
+        """Return the JSON schema."""
+        if (schema := self._schemas.get(style)) is None:
+            schema = self._schemas[style] = schema_text(self.message, style)
+        return schema
 
     def text(self, style: Style, cdr: bytes) -> bytes:
         """Convert CDR to JSON. Raises UnreadableError if that is impossible."""

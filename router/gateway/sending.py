@@ -247,7 +247,7 @@ class TopicSender:
         data = self._encoding.schema(
             subscription.topic,
             subscription.type_name,
-            subscription.schemas[self._encoding.style],
+            subscription.schema(self._encoding.style),
             self._context.wall_s(),
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)

@@ -67,7 +67,7 @@ class TopicSubscription:
     ) -> None:
         self.topic = topic
         self.type_name = ready.message.name
-        self.schemas = ready.schemas
+        self.schema = ready.schema
         self._type = ready
         self._topics = topics
         self._loop = loop

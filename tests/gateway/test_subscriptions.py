@@ -141,7 +141,7 @@ async def test_the_latest_value_is_the_newest_and_stays_until_another_one_comes(
     async with opened() as subscriptions:
         subscription = subscriptions.join("/greeting", PLAIN, None)
         assert (subscription.topic, subscription.type_name) == ("/greeting", STRING)
-        assert json.loads(subscription.schemas[Style.PLAIN])["name"] == "String"
+        assert json.loads(subscription.schema(Style.PLAIN))["name"] == "String"
         assert subscription.latest() is None
         peer = publisher(STRING)
         await matched(peer)
@@ -383,7 +383,7 @@ async def test_a_part_of_a_service_is_followed_though_no_msg_file_declares_it(pu
         assert sample.type_name == EVENT
         value = json.loads(sample.text(Style.PLAIN))
         assert (value["request"], value["response"]) == ([{"names": ["speed"]}], [])
-        schema = json.loads(subscription.schemas[Style.PLAIN])
+        schema = json.loads(subscription.schema(Style.PLAIN))
         assert (schema["name"], schema["namespace"]) == ("GetParameters_Event", "rcl_interfaces::srv")
         request = schema["fields"][1]["subtype"]
         assert (request["name"], request["namespace"]) == ("GetParameters_Request", "rcl_interfaces::srv")
