@@ -1,16 +1,32 @@
-"""Which clients a server admits: those of the networks in `from`, and no pages of other hosts."""
+"""How TCP servers listen, and whom they admit: clients of the networks in `from`, and no pages of other hosts."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
+import socket
 from collections import Counter
 from collections.abc import Sequence
 
+from router.errors import SourceSpan
 from router.log import FloodLog, logger
+from router.net.kernel import why_not_bound
+from router.table.addresses import Address
 
 _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
 """IP addresses, and names that nobody can register on the internet."""
+
+
+def listen(address: Address, span: SourceSpan, what: str, key: str) -> socket.socket:
+    """Return a listening socket. Raises StartError at `span`, which says that `what` cannot be served.
+
+    `key` is that of the address in a table.
+    """
+    try:
+        return socket.create_server(address, backlog=256)
+    except OSError as error:
+        kind, why, _ = why_not_bound("tcp", address.port, error)
+        raise kind(f"{span}: cannot serve {what} at {address}: {why}", f"choose another {key}") from error
 
 
 def is_own_computer(peer: str, own: str) -> bool:

@@ -29,8 +29,7 @@ from websockets.typing import Subprotocol
 from router.clock import wall_ns
 from router.compiler.program import Program
 from router.log import FloodLog, fault, logger_of_library
-from router.net.doors import Door, is_foreign
-from router.net.kernel import why_not_bound
+from router.net.doors import Door, is_foreign, listen
 from router.observe.running import Running
 from router.recording.channels import descriptor_set
 from router.recording.mirror import Classifier, Mirrored, payload_number
@@ -142,7 +141,7 @@ class FoxgloveServer:
         self._detach: Callable[[], None] | None = None
         self._view = self._view_of(running.program)
         self._session = str(wall_ns())
-        listening = _listening(settings)
+        listening = listen(settings.address.value, settings.address.span, "Foxglove", "foxglove.address")
         self.address = Address(*listening.getsockname())
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
@@ -392,16 +391,6 @@ def _rejection(connection: ServerConnection, request: Request) -> Response | Non
     if not is_app and is_foreign(request.headers.get_all("Host"), origins):
         return connection.respond(HTTPStatus.FORBIDDEN, "pages of other hosts may not connect\n")
     return None
-
-
-def _listening(settings: ServerSettings) -> socket.socket:
-    address = settings.address.value
-    try:
-        return socket.create_server(address)
-    except OSError as error:
-        kind, why, _ = why_not_bound("tcp", address.port, error)
-        what = f"{settings.address.span}: cannot serve Foxglove at {address}: {why}"
-        raise kind(what, "choose another foxglove.address") from error
 
 
 _LOG = logger_of_library("router.foxglove", "websockets")

@@ -41,8 +41,7 @@ from prometheus_client.exposition import gzip_accepted
 from router.errors import SourceSpan, StartError
 from router.log import FloodLog, fault
 from router.net import control
-from router.net.doors import Door, is_foreign, is_own_computer
-from router.net.kernel import why_not_bound
+from router.net.doors import Door, is_foreign, is_own_computer, listen
 from router.observe.requests import BadRequestError, Request, parse
 from router.observe.responses import PAGES, SAVE, Responder, Response, plain
 from router.observe.running import Running
@@ -104,7 +103,7 @@ class HttpServer:
         self._connections = connections = Connections()
         responder = Responder(running, health, self._status, save)
         with ExitStack() as opening:
-            listening = opening.enter_context(_listening(address, span))
+            listening = opening.enter_context(listen(address, span, "HTTP", "http.address"))
             self.address = Address(*listening.getsockname())
             controlled = opening.enter_context(_control(self.address, span))
             self._servers = [_Server("http", listening, door, connections, responder)]
@@ -120,14 +119,6 @@ class HttpServer:
             server.socket.close()
         self._status.close()
         self._door.close()
-
-
-def _listening(address: Address, span: SourceSpan) -> socket.socket:
-    try:
-        return socket.create_server(address, backlog=256)
-    except OSError as error:
-        kind, why, _ = why_not_bound("tcp", address.port, error)
-        raise kind(f"{span}: cannot serve HTTP at {address}: {why}", "choose another http.address") from error
 
 
 def _control(address: Address, span: SourceSpan) -> socket.socket:
