@@ -101,8 +101,8 @@ def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
 
 
 def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: Iterator[Entry], first: Entry) -> None:
-    from router.tools.show import shown
-    from router.tools.tap import Condition, Filter
+    from router.recording.reader import RecordedAction
+    from router.tools.tap import Condition, Filter, shown
 
     cases = [wire.case(name) for name in args.cases] or list(wire.envelope.cases.values())
     if args.where and not cases:
@@ -116,7 +116,7 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
         for entry in entries:
             last = entry.at
             if span is None or span[0] <= entry.at <= span[1]:
-                as_shown = shown(entry, wire)
+                as_shown = shown(entry.action if isinstance(entry, RecordedAction) else entry, wire)
                 if chosen.takes(as_shown, entry.at):
                     yield as_shown.json(False) if args.json else as_shown.line(False)
 
@@ -135,7 +135,7 @@ def _explain(
 ) -> None:
     from router.recording.about import routes_of
     from router.tools.stops import Stops
-    from router.tools.tap import shown_action
+    from router.tools.tap import shown
 
     stops, last, span = Stops(routes_of(recording.about), wire), first.at, _window(args, first)
     for entry in entries:
@@ -150,8 +150,8 @@ def _explain(
             print("\n".join(([""] if number else []) + stop.lines()))
     for each in stops.silences:
         if span is None or span[0] <= each.at <= span[1]:
-            silence = shown_action(each, wire)
-            print(silence.json() if args.json else silence.line())
+            silence = shown(each, wire)
+            print(silence.json(False) if args.json else silence.line(False))
     if not found and span is not None:
         _say_nothing(span, "no deadman tripped", last)
     elif not found and not stops.has_actions:

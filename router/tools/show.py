@@ -1,4 +1,4 @@
-"""What `router show` prints of a recording: what was received, decided and sent, in the order of time."""
+"""The entries of a recording in the order of time, and the parts of it that `router show` is asked for."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import heapq
 import re
 from collections.abc import Iterable, Iterator
 
-from router.datagrams import Wire
 from router.errors import UsageError
 from router.recording.reader import Recorded, RecordedAction
-from router.tools.tap import ShownAction, TappedDatagram, local_time, shown_action, tapped_datagram
+from router.tools.tap import local_time
 
 Entry = Recorded | RecordedAction
 
@@ -55,11 +54,3 @@ def window(around: str, margin: float, first: int) -> tuple[int, int]:
     start = int(at.timestamp() * 1e9)
     extra = int(margin * 1e9)
     return start - extra, start + (1 if has_seconds else 60) * 1_000_000_000 + extra
-
-
-def shown(entry: Entry, wire: Wire) -> TappedDatagram | ShownAction:
-    """Return an entry as it is printed."""
-    if isinstance(entry, RecordedAction):
-        return shown_action(entry.action, wire)
-    peer = entry.endpoint or f"{entry.peer[0]}:{entry.peer[1]}"
-    return tapped_datagram(entry.at, peer, entry.data, wire, entry.reason)

@@ -32,6 +32,7 @@ from router.types.protobuf import Envelope, PayloadCase
 from router.values import clock_text, compact, one_line, protobuf_json, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
+    from router.recording.reader import Recorded
     from router.ros.topics import TopicListener
 
 
@@ -162,7 +163,7 @@ class ShownAction:
     action: Action
     decoded: Decoded | None
 
-    def line(self, with_hex: bool = False) -> str:
+    def line(self, with_hex: bool) -> str:
         """Return one line: `12:00:00.123+0200 sent to driving_board (drive from topic cmd): drive left=5`."""
         del with_hex  # nothing is shown in hexadecimal
         return f"{clock_text(self.at)} {self._what()}"
@@ -194,7 +195,7 @@ class ShownAction:
             return f"undecodable: {self.action.data.hex()}"
         return f"{self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}".rstrip()
 
-    def json(self, with_hex: bool = False) -> str:
+    def json(self, with_hex: bool) -> str:
         """Return one JSON object."""
         del with_hex
         it = self.action
@@ -275,14 +276,8 @@ class RunningTap:
             self.missed += sum(each.number for each in batch if isinstance(each, Lost))
             found = [each for each in batch if not isinstance(each, Lost)]
             found.sort(key=lambda each: each.at)  # actions come apart from datagrams
-            made = [(self._shown(each), each.at) for each in found]
-            yield [shown for shown, at in made if self._filter.takes(shown, at)]
-
-    def _shown(self, each: MirroredDatagram | Action) -> TappedDatagram | ShownAction:
-        if isinstance(each, Action):
-            return shown_action(each, self._wire)
-        peer = each.endpoint or f"{each.peer[0]}:{each.peer[1]}"
-        return tapped_datagram(each.at, peer, each.data, self._wire, each.reason)
+            made = [(shown(each, self._wire), each.at) for each in found]
+            yield [as_shown for as_shown, at in made if self._filter.takes(as_shown, at)]
 
 
 def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
@@ -316,9 +311,12 @@ def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str =
         return TappedDatagram(local_time(at), peer, data, None, str(error), rejected)
 
 
-def shown_action(action: Action, wire: Wire) -> ShownAction:
+def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> TappedDatagram | ShownAction:
+    """Return a datagram or an action as it is printed."""
+    if not isinstance(it, Action):
+        return tapped_datagram(it.at, it.endpoint or f"{it.peer[0]}:{it.peer[1]}", it.data, wire, it.reason)
     try:
-        decoded = wire.decode(action.data) if action.what in (SENT, BRAKED) and action.data else None
+        decoded = wire.decode(it.data) if it.what in (SENT, BRAKED) and it.data else None
     except DecodeError:
         decoded = None
-    return ShownAction(local_time(action.at), action, decoded)
+    return ShownAction(local_time(it.at), it, decoded)
