@@ -75,11 +75,11 @@ def _key(case: PayloadCase) -> _ChannelKey:
 
 
 class _View(NamedTuple):
-    """A program, and the numbers of its channels by payload case."""
+    """A program, and the numbers of its channels by the field number of the payload case."""
 
     program: Program
     classifier: Classifier
-    channels: Mapping[str, int]
+    channels: Mapping[int, int]
 
 
 class _Message(NamedTuple):
@@ -300,27 +300,24 @@ class FoxgloveServer:
 
     def _view_of(self, program: Program) -> _View:
         channels = {}
-        for name, case in program.envelope.cases.items():
+        for case in program.envelope.cases.values():
             key = _key(case)
             if key not in self._numbers:
                 self._numbers[key] = self._next_number
                 self._next_number += 1
-            channels[name] = self._numbers[key]
+            channels[case.number] = self._numbers[key]
         return _View(program, Classifier(program.envelope, program.table), channels)
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
         """Send the accepted payloads of subscribed channels. Called by the mirror."""
-        program, classifier, channels = self._view
-        numbers = {name: case.number for name, case in program.envelope.cases.items()}
-        known = frozenset(numbers.values())
-        wanted = {number for name, number in numbers.items() if channels[name] in self._wanted}
+        _, classifier, channels = self._view
         messages = []
         for at, listener, _, _, reason, data in batch:
-            if reason or payload_number(data, known) not in wanted:
+            if reason or channels.get(payload_number(data, channels)) not in self._wanted:
                 continue
             if (found := classifier.encoded_payload(listener, data)) is not None:
                 case, payload = found
-                messages.append(_Message(channels[case.name], at, payload))
+                messages.append(_Message(channels[case.number], at, payload))
         self._arrived.extend(messages)
         if messages and not self._is_showing:
             self._is_showing = True
