@@ -297,9 +297,8 @@ class Look:
         """Return a number of losses with the routes that have most of them."""
         routes = [route for route, _ in counts.most_common() if route]
         of = f" of {', '.join(routes[:MOST_NAMED])}" if routes else ""
-        return f"{counts.total()}{of}" + (
-            f" and {len(routes) - MOST_NAMED} more routes" if len(routes) > MOST_NAMED else ""
-        )
+        more = len(routes) - MOST_NAMED
+        return f"{counts.total()}{of}" + (f" and {more} more routes" if more > 0 else "")
 
     def _returned(self) -> Iterator[Problem]:
         """Yield endpoints that were silent a while ago."""

@@ -288,8 +288,10 @@ def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
 
 
 def length(lowering: Lowering, node: tree.Node) -> Routine:
-    """Lower len() of a list. The messages of a literal are not values, but must exist. There are as many messages in
-    the elements of a list as elements.
+    """Lower len() of a list.
+
+    The messages of a literal are not values, but must exist. A message in each element of a list is none either: there
+    are as many as elements.
     """
     while isinstance(node, tree.Each) and isinstance(node.kind.element, MessageKind):
         ((_, node),) = node.lists
