@@ -295,8 +295,10 @@ class FoxgloveServer:
         added = [_advertised(number, key) for key, number in self._numbers.items() if key not in before]
         for client in self._clients.values():
             client.subscriptions = {each: sub for each, sub in client.subscriptions.items() if each not in gone}
-            client.order(op="unadvertise", channelIds=gone)
-            client.order(op="advertise", channels=added)
+            if gone:
+                client.order(op="unadvertise", channelIds=gone)
+            if added:
+                client.order(op="advertise", channels=added)
 
     def _view_of(self, program: Program) -> _View:
         channels = {}
