@@ -11,7 +11,7 @@ from pathlib import Path
 ROUTER = Path(__file__).parents[1] / "router"
 
 GROUND = "declared errors shortage inputs assets lean clock log threads"
-LANGUAGE = "declared errors shortage inputs assets lean table types compiler"
+LANGUAGE = "declared errors shortage inputs assets lean library table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
@@ -20,12 +20,13 @@ IMPORTS = {
     "assets": "",
     "clock": "",
     "lean": "",
+    "library": "declared errors shortage assets",
     "log": "clock errors lean shortage",
     "threads": "clock log shortage",
     "table": "errors inputs assets lean",
     "types": "declared errors inputs assets lean",
     "values": "errors types",
-    "compiler": "declared errors inputs assets lean table types",
+    "compiler": "declared errors inputs assets lean library table types",
     "datagrams": "declared errors table types",
     "net": f"{GROUND} {LANGUAGE} datagrams",
     "carrier": f"{GROUND} {LANGUAGE} datagrams net",
@@ -41,7 +42,7 @@ IMPORTS = {
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"declared", "errors", "lean", "table", "types", "values", "compiler", "datagrams"}
+PURE = {"declared", "errors", "lean", "library", "table", "types", "values", "compiler", "datagrams"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -37,16 +37,16 @@ def imported(script: str) -> set[str]:
         ("from router.log import logger, FloodLog; FloodLog()", LOG),
         ("import router.net.sockets", {*LOG, *NET}),
         (
-            "from router.carrier import library, ring, threads, carrier, sender; library.library()",
+            "from router import library; from router.carrier import ring, threads, carrier, sender; library.library()",
             {
-                "router.carrier", "router.carrier.library", "router.carrier.ring", "router.carrier.threads",
+                "router.carrier", "router.library", "router.carrier.ring", "router.carrier.threads",
                 "router.carrier.carrier", "router.carrier.sender", *GROUND, *NET,
             },
         ),
         (
             "import router.kept.head_start",
             {
-                "router.carrier", "router.carrier.library", "router.carrier.ring", "router.carrier.threads",
+                "router.carrier", "router.library", "router.carrier.ring", "router.carrier.threads",
                 "router.carrier.carrier", "router.carrier.sender", "router.carrier.deadmen", "router.carrier.deferrals",
                 "router.carrier.forwarding", "router.carrier.names", "router.carrier.state", "router.inputs",
                 "router.kept", "router.kept.store", "router.kept.head_start", *GROUND, *NET,

@@ -18,12 +18,12 @@ from router.app.runtime import Change, Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
 from router.carrier.events import DeadmanChange, DeadmanEvents
 from router.carrier.forwarding import Forwarding
-from router.carrier.library import load
 from router.clock import boottime_ns
 from router.compiler.metrics import Answer, Evidence, Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.kept.head_start import HeadStart
+from router.library import load
 from router.log import logger
 from router.net.doors import Door
 from router.net.udp import Listener

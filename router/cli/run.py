@@ -61,9 +61,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from router.app.keeping import Keeper
-    from router.carrier.library import library
     from router.compiler.check import uncollected
     from router.kept.head_start import ATTEMPTS
+    from router.library import library
     from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
@@ -105,7 +105,7 @@ def _log(attempt: HeadStartAttempt) -> None:
 def _reconcile(attempt: HeadStartAttempt, program: Program, read: inputs.Inputs) -> str:
     """Close a head start that differs from the compiled program. Return how the router starts, as in STARTS."""
     from router.carrier.image import image_of
-    from router.carrier.library import library
+    from router.library import library
 
     if attempt.head_start is None:
         return "refused" if attempt.why else "compiled"

@@ -15,11 +15,11 @@ from router import declared as c
 from router.carrier.deadmen import datagrams_of
 from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.forwarding import KEPT_GENERATION, Forwarding
-from router.carrier.library import library
 from router.carrier.sender import NativeSender
 from router.carrier.state import open_native
 from router.clock import boottime_ns
 from router.kept import store
+from router.library import library
 from router.net.sockets import ListeningSocket, open_sending, placed
 
 TYPE_CHECKING = False

@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from router.carrier.events import CountedReport, DeadmanChange
-from router.carrier.library import library
 from router.carrier.rehearsal import Increment, Output, Stage, Time
 from router.compiler.metrics import Answer, Series
 from router.compiler.program import Program
 from router.datagrams import Peer
+from router.library import library
 
 START = 1_767_225_600_000_000_000
 """The time at the start, unless another one is given: the beginning of 2026, in ns of the wall clock."""

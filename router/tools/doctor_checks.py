@@ -18,9 +18,9 @@ from time import monotonic
 from typing import NamedTuple
 
 from router.assets import asset
-from router.carrier.library import load
 from router.compiler.program import Program
 from router.errors import Located, StartError, listed, plural, shown_path
+from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable

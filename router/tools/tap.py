@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from google.protobuf.message import Message
 
 from router.carrier.conditions import NativeCondition
-from router.carrier.library import library
 from router.clock import wall_ns
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
@@ -22,6 +21,7 @@ from router.compiler.lowering import lower_condition
 from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
+from router.library import library
 from router.observe.tap import Lost
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.model import Expression

@@ -8,10 +8,10 @@ from typing import cast
 import pytest
 
 from router.app.keeping import Keeper
-from router.carrier.library import library
 from router.compiler.program import Program
 from router.inputs import Inputs
 from router.kept import store
+from router.library import library
 
 PROGRAM = cast("Program", object())
 

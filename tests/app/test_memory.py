@@ -19,8 +19,8 @@ from grpc_tools import _protoc_compiler
 from router.app import Router
 from router.app.memory import Mapping, read_only
 from router.carrier.forwarding import MOST_COUNTERS, counts_and_events
-from router.carrier.library import load
 from router.carrier.ring import Ring
+from router.library import load
 from tests.app.conftest import Site
 from tests.ports import free_port
 

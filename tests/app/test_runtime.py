@@ -24,12 +24,12 @@ from router.app.keeping import Keeper
 from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.carrier.carrier import Carrier
-from router.carrier.library import load
 from router.carrier.publishing import PublishThread
 from router.compiler.metrics import REJECT_REASONS
 from router.declared import MAX_DATAGRAM
 from router.errors import StartError
 from router.inputs import Inputs
+from router.library import load
 from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored

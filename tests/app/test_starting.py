@@ -216,8 +216,7 @@ def test_without_its_library_it_says_so_and_ends(table: Path, tmp_path: Path) ->
     """With no thread left that keeps the process alive, while signals are blocked."""
     nowhere = tmp_path / "libcarrier.so"
     (tmp_path / "sitecustomize.py").write_text(
-        "from pathlib import Path; from router.carrier.library import load; "
-        f"load.__defaults__ = (Path({str(nowhere)!r}),)"
+        f"from pathlib import Path; from router.library import load; load.__defaults__ = (Path({str(nowhere)!r}),)"
     )
     said = [f"router run: {nowhere} was not built, and nothing runs without it", "help: run 'make setup'"]
     assert ended("run", table, path=str(tmp_path)) == (78, said)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from router.carrier.build import LIBRARY, NATIVE, build, compile_c, sources
-from router.carrier.library import load
+from router.library import load
 
 MEMORY = "address,undefined"
 RACES = "thread"

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from router.carrier.build import LIBRARY, build, is_current
-from router.carrier.library import load
 from router.compiler.lookup import Definitions
+from router.library import load
 from tests.carrier import building
 from tests.carrier import deferring as of_deferrals
 from tests.carrier import delivering as of_delivery

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from router.carrier.arrays import Arrays
 from router.carrier.build import build, is_current
-from router.carrier.library import load
 from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope
+from router.library import load
 from tests.carrier.delivering import Payload
 from tests.oracles.envelopes import Decision
 from tests.small_tables import program

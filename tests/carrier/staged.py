@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from router.carrier.events import CountedReport
-from router.carrier.library import library
 from router.carrier.rehearsal import Output, Stage
 from router.compiler.program import Program
+from router.library import library
 from tests.small_tables import Ledger
 
 START = 10**12

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from router.carrier import build
-from router.carrier.library import load
+from router.library import load
 
 COMPILERS = [compiler for compiler in ("gcc", "clang") if shutil.which(compiler)]
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.carrier.library import load
 from router.carrier.limits import Freshness, TimeRange
+from router.library import load
 from tests.oracles import ages_and_rates as oracle
 from tests.oracles.ages_and_rates import MEMORY, TOLERANCE
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from router import declared
-from router.carrier import build, library
-from router.carrier.library import load
+from router import declared, library
+from router.carrier import build
 from router.errors import StartError
+from router.library import load
 
 
 def test_without_a_library_nothing_runs(tmp_path: Path) -> None:
@@ -30,15 +30,25 @@ def installed(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     (tmp_path / "native").mkdir()
     for source in SOURCES:
         (tmp_path / source).touch()
+    _say(tmp_path, declared.CHECKSUM)
+    for source in SOURCES:
         os.utime(tmp_path / source, ns=(0, made.stat().st_mtime_ns - 1))
     monkeypatch.setattr(library, "_CARRIER", str(tmp_path))
     monkeypatch.setattr(library, "NATIVE", str(tmp_path / "native"))
     return made
 
 
+def _say(folder: Path, checksum: str) -> None:
+    """Write a build script that returns this checksum of the sources. Its time of modification is that of before."""
+    script = folder / "build.py"
+    times = script.stat()
+    script.write_text(f"def checksum():\n    return {checksum!r}\n")
+    os.utime(script, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
 @pytest.mark.parametrize("changed", SOURCES)
-def test_a_library_of_other_sources_is_refused(installed: Path, changed: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "checksum", lambda: "0" * 64)
+def test_a_library_of_other_sources_is_refused(installed: Path, changed: str) -> None:
+    _say(installed.parent, "0" * 64)
     load(installed)  # no source was changed since: none is read
     os.utime(installed.parent / changed, ns=(0, installed.stat().st_mtime_ns))
     with pytest.raises(StartError, match="was built from other sources; run 'make setup'"):
@@ -50,8 +60,9 @@ def test_sources_that_are_younger_and_the_same_are_no_others(installed: Path) ->
     load(installed)
 
 
-def test_what_builds_the_library_and_what_loads_it_name_the_same_file() -> None:
+def test_what_builds_the_library_and_what_loads_it_name_the_same_file_and_sources() -> None:
     assert Path(library.LIBRARY) == build.LIBRARY
+    assert library._checksum() == build.checksum()
 
 
 def test_what_is_no_library_is_refused(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.carrier.library import load
 from router.carrier.limits import RateLimit
 from router.declared import Limit
+from router.library import load
 from tests.oracles import ages_and_rates as oracle
 
 NS = 1_000_000_000

@@ -13,7 +13,6 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
-from router.carrier.library import library
 from router.carrier.names import Names
 from router.carrier.reasons import _WORDS, LOSSES, REJECTIONS
 from router.carrier.rehearsal import Stage
@@ -21,6 +20,7 @@ from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASO
 from router.compiler.program import Program
 from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
+from router.library import library
 from router.observe.reports import Reporter
 from router.table.addresses import Address
 from tests.boards.board import REQUIRED

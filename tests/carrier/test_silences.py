@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from router.carrier.events import Returned
-from router.carrier.library import library
 from router.carrier.rehearsal import Stage
 from router.compiler.program import Program
+from router.library import library
 from tests.small_tables import HEAD, MS, SECOND, SENSOR_BOARD, enveloped, program
 
 ROUTE = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from router.carrier.library import load
 from router.carrier.state import State
+from router.library import load
 
 
 def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:

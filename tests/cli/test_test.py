@@ -12,11 +12,11 @@ import jsonschema
 import pytest
 
 from router.assets import asset
-from router.carrier.library import load
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from router.cli.test import FAILED
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
+from router.library import load
 from router.rehearsal.reading import SCHEMA, TestFile, read_test_file
 from router.rehearsal.running import run_tests
 from router.table.schema import table_schema

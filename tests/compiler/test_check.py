@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from router.carrier.image import image_of
-from router.carrier.library import library
 from router.compiler import check, check_table
 from router.errors import Code
+from router.library import library
 from tests.bad_tables.corpus import HERE
 from tests.tables import ROUTES
 

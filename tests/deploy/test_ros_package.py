@@ -133,7 +133,7 @@ def test_executable_may_be_executed_where_it_is_built_too(installed: Path) -> No
 
 
 def test_the_carrier_is_built_and_installed(installed: Path) -> None:
-    script = "from router.carrier.library import load; print(load()._name)"
+    script = "from router.library import load; print(load()._name)"
     loaded = subprocess.check_output([sys.executable, "-c", script], env=environment(installed), cwd="/", text=True)
     assert Path(loaded.strip()).is_relative_to(installed)
 

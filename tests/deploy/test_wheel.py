@@ -109,7 +109,7 @@ def ship(packages: Path, proto: str) -> Path:
 def loaded(packages: Path) -> str:
     """The carrier's library in an installation, or why there is none."""
     script = """
-from router.carrier.library import load
+from router.library import load
 from router.errors import StartError
 try: print(load())
 except StartError as error: print(error)"""

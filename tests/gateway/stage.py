@@ -12,7 +12,6 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, cast
 
-from router.carrier.library import load
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.metrics import Report
@@ -25,6 +24,7 @@ from router.gateway.inbound import InboundOutputs, InboundPublisher
 from router.gateway.service import GatewayService
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
+from router.library import load
 from router.ros.topics import DiscoveredPublisher, RosTopics
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces

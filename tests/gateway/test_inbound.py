@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.carrier.library import load
 from router.clock import monotonic_ns, wall_ns
 from router.gateway.encoding import ENCODINGS
 from router.gateway.inbound import InboundOutputs, InboundPublisher, RefusedError
 from router.gateway.packets import Packet, pack
+from router.library import load
 from tests.gateway.stage import program
 
 STRING = "std_msgs/msg/String"

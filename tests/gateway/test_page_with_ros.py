@@ -15,8 +15,8 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
 
-from router.carrier.library import load
 from router.gateway.thread import GatewayThread
+from router.library import load
 from tests.gateway.browser import Browser
 from tests.gateway.pictures import IMAGE, TIMES, png, shown_pixel
 from tests.gateway.stage import program

@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.carrier.library import load
 from router.compiler.program import Program
 from router.errors import StartError
 from router.gateway.thread import GatewayThread
 from router.gateway.transport.tcp import TcpTransport
+from router.library import load
 from tests.gateway.stage import Graph, program
 from tests.ports import free_port
 

@@ -24,12 +24,12 @@ from router.app.runtime import Runtime
 from router.carrier import events
 from router.carrier.carrier import Carrier
 from router.carrier.image import image_of
-from router.carrier.library import library
 from router.cli import run
 from router.compiler.program import Program
 from router.kept import head_start as head_starts
 from router.kept.head_start import HeadStart, HeadStartAttempt
 from router.kept.store import Kept
+from router.library import library
 from router.net.sockets import ListeningSocket, open_sending
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, site

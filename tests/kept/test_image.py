@@ -85,7 +85,7 @@ DIGEST = """\
 import sys, zlib, marshal
 from pathlib import Path
 from router.carrier.image import image_of
-from router.carrier.library import library
+from router.library import library
 from router.compiler import check_table
 for path in sys.argv[1:]:
     parts, image = image_of(library(), check_table(Path(path)).program)

@@ -1,4 +1,4 @@
-"""Finds and loads the carrier's library, which `build.py` makes, and declares its functions.
+"""Finds and loads the carrier's library, which `carrier/build.py` makes, and declares its functions.
 
 A library that was built from other sources is rejected, because its structures may differ from `router.declared`.
 A wheel contains no sources.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from router.errors import ConfigurationError
 
-_CARRIER = os.path.dirname(__file__)  # noqa: PTH120 - pathlib takes 5 ms to import
+_CARRIER = f"{os.path.dirname(__file__)}/carrier"  # noqa: PTH120 - pathlib takes 5 ms to import
 NATIVE = f"{_CARRIER}/native"
 LIBRARY = f"{NATIVE}/libcarrier.so"
 """The file that `build.py` makes."""
@@ -66,9 +66,10 @@ def _changes() -> Iterator[int]:
 
 
 def _checksum() -> str:
-    from router.carrier.build import checksum
+    """Return the checksum of the sources. The build script belongs to no layer: it runs before there is a library."""
+    from runpy import run_path
 
-    return checksum()
+    return str(run_path(f"{_CARRIER}/build.py")["checksum"]())
 
 
 def _refused(what: str) -> ConfigurationError:
