@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from google.protobuf.descriptor import FieldDescriptor
 
 from router import declared as c
-from router.carrier.arrays import Arrays
 from router.carrier.schema import wire_kind
+from router.compiler.lowering.arrays import Arrays
 from router.declared import BoardFlag, WireKind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.wire import LEN, encoding_of

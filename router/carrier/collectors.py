@@ -6,8 +6,8 @@ import ctypes
 from collections.abc import Sequence
 
 from router import declared as c
-from router.carrier.lowered import Routines
 from router.compiler.lowering import LoweredCollect
+from router.compiler.lowering.routines import Routines
 
 
 def native_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:

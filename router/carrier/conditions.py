@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ctypes
 
-from router.carrier.arrays import Arrays
-from router.carrier.lowered import Routines, native_values
 from router.compiler.lowering import LoweredCondition
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines, native_values
 from router.declared import EVALUATED, LOSSES
 
 

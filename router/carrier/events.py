@@ -11,9 +11,10 @@ from socket import inet_ntoa
 from typing import Union, cast
 
 from router.carrier.names import Names
-from router.carrier.reasons import LOSSES, REJECTIONS, why_refused
+from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
+from router.compiler.refusals import why_refused
 from router.declared import (
     NO_NAME,
     AnswerEvent,

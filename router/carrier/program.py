@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from router import declared as c
-from router.carrier.arrays import Arrays
 from router.carrier.deadmen import NativeDeadman
-from router.carrier.lowered import Routines
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import REJECTIONS
 from router.carrier.schema import wire_schema
 from router.carrier.targets import TargetStates, TargetWriter
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Program, RoutePlan, source_label

@@ -9,11 +9,11 @@ from types import MappingProxyType
 from typing import Protocol
 
 from router import declared as c
-from router.carrier.arrays import Arrays
-from router.carrier.lowered import Routines
 from router.carrier.outlets import Outlets
 from router.carrier.targets import TargetStates, TargetWriter
 from router.compiler.lowering import LoweredElements, LoweredFeed
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines
 from router.compiler.program import Program, RoutePlan
 from router.declared import NONE
 

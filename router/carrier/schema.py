@@ -7,7 +7,7 @@ from collections.abc import Container, Mapping
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router import declared as c
-from router.carrier.arrays import Arrays
+from router.compiler.lowering.arrays import Arrays
 from router.declared import WireFlag, WireKind
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
-from router.carrier.arrays import Arrays
 from router.carrier.collectors import native_collect
 from router.carrier.deferrals import Adoption
 from router.carrier.limits import period
-from router.carrier.lowered import Routines, native_values
 from router.carrier.outlets import Outlets
 from router.carrier.reasons import LOSSES
 from router.carrier.state import Native
 from router.compiler.lowering import LoweredRoute, LoweredTarget
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
 from router.table.model import OnLimit
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
-from router.carrier.arrays import Arrays
 from router.carrier.build import build, is_current
 from router.carrier.schema import wire_schema
+from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope

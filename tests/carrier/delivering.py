@@ -10,14 +10,14 @@ from struct import Struct
 from typing import NamedTuple, Union
 
 from router import declared as c
-from router.carrier.arrays import Arrays
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.collectors import native_collect
-from router.carrier.lowered import Routines, native_values
 from router.carrier.reasons import LOSSES
 from router.carrier.ros_routes import native_for_each
 from router.carrier.state import Native, open_native
 from router.compiler.lowering import LoweredFeed, LoweredRoute
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines, native_values
 from router.declared import NONE
 from tests.carrier.building import MEMORY, sanitizing
 

@@ -14,10 +14,11 @@ from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
 from router.carrier.names import Names
-from router.carrier.reasons import _WORDS, LOSSES, REJECTIONS
+from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.rehearsal import Stage
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report
 from router.compiler.program import Program
+from router.compiler.refusals import _WORDS
 from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
 from router.library import library

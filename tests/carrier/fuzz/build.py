@@ -16,9 +16,9 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from router.carrier.arrays import Arrays
 from router.carrier.build import sources
 from router.carrier.schema import wire_schema
+from router.compiler.lowering.arrays import Arrays
 from router.declared import WireSchema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table

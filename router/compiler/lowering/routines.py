@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
-from router.carrier.arrays import Arrays
+from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.layout import Layout, PlacedSection, ReadOperation, WantedField
 from router.compiler.lowering.operations import Routine
 
