@@ -246,10 +246,6 @@ class MappingError(RouterError):
     """The result of a mapping for one message does not exist, or does not fit the target."""
 
 
-class NonFiniteError(MappingError):
-    """NaN or infinity where the target can only hold a finite value."""
-
-
 class TransportError(OperatorError):
     """A network failure, for example a datagram that cannot be sent, or a router that does not answer."""
 

@@ -23,7 +23,7 @@ from router.compiler.metrics import Answer, Evidence, Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.kept.head_start import HeadStart
-from router.library import load
+from router.library import library
 from router.log import logger
 from router.net.doors import Door
 from router.net.udp import Listener
@@ -76,7 +76,7 @@ class Router:
         self._reporter = Reporter(self._address_of)
         self._obedience = Obedience()
         self._counts = ThreadCounts(program.counters)
-        forwarding = head_start.forwarding if head_start else Forwarding(load(), program.counters.size)
+        forwarding = head_start.forwarding if head_start else Forwarding(library(), program.counters.size)
         plane = Plane(forwarding, self._counts, self._reporter, self._of_deadman, program, head_start)
         self.mirror = Mirror(plane, self._reporter.failed)
         self._runtime = Runtime(plane, self._reporter, ros_args)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from router.compiler.expressions import ExpressionError, Scope, tree
-from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND, clamp
+from router.compiler.expressions.functions import FLOAT32_END, NS_PER_SECOND
 from router.compiler.expressions.kinds import (
     DURATION_TYPES,
     INT32,
@@ -291,7 +291,7 @@ def _saturate(value: tree.Node, limits: IntKind) -> tree.Node:
     kind = IntKind(max(INT32.low, limits.low), min(INT32.high, limits.high))
     literal = tree.constant_of(value)
     if isinstance(literal, int):
-        return tree.Constant(kind, value.span, int(clamp(literal, kind.low, kind.high)))
+        return tree.Constant(kind, value.span, max(kind.low, min(literal, kind.high)))
     return limited("clamp", value, kind, limits.low, limits.high)
 
 

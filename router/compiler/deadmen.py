@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from router.compiler.constants import computed, envelope_of, scalars
+from router.compiler.constants import envelope_of
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.feeds import feeding, require_hand_over, successors
 from router.compiler.lookup import Lookup
@@ -16,7 +16,7 @@ from router.compiler.mapping import build
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.declared import MOST_DESTINATIONS
-from router.errors import Code, Diagnostic, Located, MappingError, SourceSpan
+from router.errors import Code, Diagnostic, FindingError, Located, SourceSpan
 from router.table.model import (
     DEFAULT_REPEAT,
     Deadman,
@@ -27,9 +27,9 @@ from router.table.model import (
     Route,
 )
 from router.table.units import duration
+from router.types.board_limits import scalars
 from router.types.framing import trimmed
 from router.types.model import MessageType
-from router.types.protobuf import PayloadCase
 
 SHORTEST_REPEAT = 10_000_000
 """ns. A shorter interval would flood a board, which may still be busy with the last datagram."""
@@ -180,23 +180,22 @@ def _datagram(lookup: Lookup, deadman: Deadman, payload: Payload) -> bytes | Non
     if plan is None:
         return None
     try:
-        made = computed(plan)
-        datagram = envelope_of(made, case)
-    except MappingError as error:
-        lookup.report(payload.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
+        datagram = envelope_of(plan, case)
+    except FindingError as error:
+        lookup.findings.append(error.diagnostic)
         return None
-    return None if can_reach and _is_refused(lookup, deadman, payload, made, case) else datagram
+    return None if can_reach and _is_refused(lookup, deadman, payload, datagram) else datagram
 
 
-def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, made: Record, case: PayloadCase) -> bool:
-    """Report the first board that cannot decode the payload, which has these fields. Return whether there is one.
+def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, datagram: bytes) -> bool:
+    """Report the first board that cannot decode the envelope of a payload. Return whether there is one.
 
     The size was checked with the payload case.
     """
+    envelope = lookup.envelope.message_class.FromString(datagram)
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
-        bounds = board.fields.get(case.number)
-        for field, value in scalars(made, bounds.message or {}) if bounds else ():
+        for field, value in scalars(envelope, board.fields):
             if misfit := board.misfit(field, value):
                 allow = f"set `allow_non_finite: true` for '{name}' if its firmware handles {value}"
                 hint = f"send a finite number, or {allow}" if isinstance(value, float) else ""

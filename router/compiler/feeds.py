@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
-from router.compiler.constants import computed, envelope_of
+from router.compiler.constants import envelope_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
-from router.errors import Code, MappingError, did_you_mean
+from router.errors import Code, FindingError, did_you_mean
 from router.table.model import Deadman, Destination, FieldMap, Route
 from router.types.model import MessageType
 
@@ -158,8 +158,8 @@ def _constants(lookup: Lookup, route: Route, board: str) -> Iterator[tuple[str, 
             alone = FieldMap(fields.span, auto=False, entries=(entry,))
             mapping = build(alone, case.type, scope, fields.span)
             if mapping.plan is not None and not mapping.findings:
-                with suppress(MappingError):  # reported with the route
-                    yield ".".join(entry.path), envelope_of(computed(mapping.plan), case)
+                with suppress(FindingError):  # the machine drops the message, or it is reported with the route
+                    yield ".".join(entry.path), envelope_of(mapping.plan, case)
 
 
 def _field_maps(route: Route, board: str) -> Iterable[FieldMap]:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from router.compiler.constants import cdr_of, computed
+from router.compiler.constants import cdr_of
 from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
 from router.compiler.lookup import Lookup
 from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.selection import pattern_problem
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
-from router.errors import Code, Diagnostic, MappingError
+from router.errors import Code, Diagnostic, FindingError
 from router.table.model import Gateway, Inbound, RouteTable
 from router.types.model import MessageType
 
@@ -85,13 +85,12 @@ def _deadman(
     deadman = inbound.deadman
     if deadman is None:
         return None
-    span = deadman.fields.span
-    plan = constant_plan(lookup, deadman.fields, ros_type, span, ros_type)
+    plan = constant_plan(lookup, deadman.fields, ros_type, deadman.fields.span, ros_type)
     if plan is None:
         return None
     try:
-        message = cdr_of(computed(plan))
-    except MappingError as error:
-        lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
+        message = cdr_of(plan)
+    except FindingError as error:
+        lookup.findings.append(error.diagnostic)
         return None
     return deadman_plan(f"{gateway.name}:{name}", deadman, [(name, (message,))])

@@ -7,10 +7,11 @@ compiler checks the payloads of deadmen.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import Message
 
 from router.errors import plural
 from router.types.boards import OptionsOf, integers, is_list, is_required, longest, stored_type, why_unbounded
@@ -64,6 +65,17 @@ def places(message: BoardMessage) -> tuple[int, int]:
     below = [places(field.message) for field in message.values() if field.message is not None]
     lists = sum(field.most is not None for field in message.values())
     return 1 + sum(messages for messages, _ in below), lists + sum(lists for _, lists in below)
+
+
+def scalars(message: Message, fields: BoardMessage) -> Iterator[tuple[BoardField, object]]:
+    """Yield the scalars of a message with their fields, if boards have limits for them."""
+    for descriptor, value in message.ListFields():
+        field = fields.get(descriptor.number)
+        for element in value if descriptor.is_repeated else (value,):
+            if field is not None and field.message is not None:
+                yield from scalars(element, field.message)
+            elif field is not None:
+                yield field, element
 
 
 @dataclass(frozen=True, slots=True)

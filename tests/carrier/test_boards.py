@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier.boards import NativeBoards
-from router.compiler.constants import computed, envelope_of, scalars
+from router.compiler.constants import envelope_of
 from router.compiler.mapping import build
 from router.declared import BoardRefusal, Loss
 from router.errors import Located, SourceSpan
 from router.table.model import FieldMap
-from router.types.board_limits import BoardLimits, board_fields
+from router.types.board_limits import BoardLimits, board_fields, scalars
 from router.types.model import MessageType
 from router.types.protobuf import find_envelope, load_protos
 from tests.boards.board import REQUIRED
@@ -227,9 +227,9 @@ def test_what_a_deadman_sends_is_judged_alike_before_it_is_sent(boards: Boards, 
     declared, limits = boards.envelope.cases[case], boards.limits["strict"]
     mapping = build(fields, declared.type, scope_of(MessageType("nothing")), SPAN)
     assert not mapping.findings
-    payload = computed(mapping.plan)
-    said = [limits.misfit(*each) for each in scalars(payload, limits.fields[declared.number].message or {})]
-    found = boards.refusal(envelope_of(payload, declared))
+    datagram = envelope_of(mapping.plan, declared)
+    said = [limits.misfit(*each) for each in scalars(boards.envelope.message_class.FromString(datagram), limits.fields)]
+    found = boards.refusal(datagram)
     assert list(filter(None, said)) == ([found.text] if found else [])
 
 

@@ -19,11 +19,16 @@ from router.carrier.build import LIBRARY, build, is_current
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.lowering import lower_table
 from router.compiler.plan import Record
-from router.errors import Located, MappingError, NonFiniteError, SourceSpan
+from router.errors import Located, MappingError, SourceSpan
 from router.table.model import Topic
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import Delivering, delivering
+
+
+class NonFiniteError(MappingError):
+    """The carrier has dropped the message as `non_finite`."""
+
 
 FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
 """Exceptions for a message without a result, here and in the oracle."""

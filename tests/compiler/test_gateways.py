@@ -145,6 +145,7 @@ def test_gateways_do_not_send_to_each_other(check_text: CheckText) -> None:
         (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: y}}}}}}", [Code.UNKNOWN_FIELD]),
         (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: received_at}}}}}}", [Code.UNKNOWN_FIELD]),
         (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: '1 / 0'}}}}}}", [Code.OUT_OF_RANGE]),
+        (f"{{{TWIST}, ttl: 1s, deadman: {{timeout: 1s, send: {{linear.x: sqrt(-1)}}}}}}", [Code.BAD_VALUE]),
         (
             "{topic: /a, type: std_msgs/msg/UInt8, ttl: 1s, deadman: {timeout: 1s, send: {data: 256}}}",
             [Code.OUT_OF_RANGE],
@@ -239,6 +240,7 @@ def test_inbound_topics_are_planned_by_absolute_names_and_published_once(check_t
         ("std_msgs/msg/Empty", "{}", "00010000 00"),
         ("std_msgs/msg/Float64", "{}", "00010000 0000000000000000"),
         ("std_msgs/msg/Float64", "{data: -0.5}", "00010000 000000000000e0bf"),
+        ("std_msgs/msg/Float64", "{data: sqrt(6.25)}", "00010000 0000000000000440"),
         ("geometry_msgs/msg/Vector3", "{y: 1.0}", "00010000 0000000000000000 000000000000f03f 0000000000000000"),
         ("std_msgs/msg/String", "{data: \"'halt'\"}", "00010000 05000000 68616c7400"),
         ("std_msgs/msg/String", "{}", "00010000 01000000 00"),

@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from router.errors import NonFiniteError
 from router.rehearsal.cdr import deserialize
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import compiled, field_map, scope_of, serializer
-from tests.compiler.machine import FAILURES
+from tests.compiler.machine import FAILURES, NonFiniteError
 
 I64, U64, U32 = Int(64, signed=True), Int(64, signed=False), Int(32, signed=False)
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))

@@ -10,16 +10,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, assume, event, given, settings
+from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.constants import computed, envelope_of
+from router.compiler.constants import envelope_of
 from router.compiler.expressions import check
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.expressions.kinds import StringKind, TimeKind
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
-from router.errors import Code, MappingError
+from router.errors import Code, FindingError, MappingError
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
@@ -366,7 +366,7 @@ def constant(case: str, fields: FieldMap) -> bytes:
     scope = scope_of(MessageType("nothing"), tuple(schema.enums.values()))
     mapping = build(fields, declared.type, scope, SPAN)
     assert mapping.findings == []
-    return envelope_of(computed(mapping.plan), declared)
+    return envelope_of(mapping.plan, declared)
 
 
 def test_an_envelope_of_constants_is_that_of_the_reference() -> None:
@@ -406,6 +406,25 @@ def test_constants_are_computed_as_the_reference_does(text: str) -> None:
     assert constant("scalars", fields) == expected
 
 
+@given(*[st.floats(-1e6, 1e6)] * 2)
+@example(32.6323351048564, 11.392827114328364)
+def test_a_constant_is_what_a_mapping_makes_of_the_same_values(x: float, y: float) -> None:
+    functions = "hypot({x}, {y})", "atan2({x}, {y})", "cos({x})", "tan({y})", "degrees({x})", "abs({x}) ** 7"
+    texts = f"[{', '.join(f'text({each}, 17)' for each in functions)}]"
+    source = MessageType("made/msg/Source", (Field("x", F64), Field("y", F64)))
+    case = made_wire()[1].cases["many"]
+    mapped = compiled_envelope(made_wire(), case, field_map(texts=texts.format(x="x", y="y")), source)
+    assert constant("many", field_map(texts=texts.format(x=x, y=y))) == mapped(SimpleNamespace(x=x, y=y))
+
+
+def test_constants_are_nested_as_deeply_as_in_a_mapping() -> None:
+    nested = "1"
+    for _ in range(20):
+        nested = f"sum([{', '.join('0' * 15)}, {nested}])"
+    with pytest.raises(FindingError, match="more than 255 intermediate values are needed here"):
+        constant("scalars", field_map(u64=nested))
+
+
 @pytest.mark.parametrize(
     ("case", "fields"),
     [
@@ -419,5 +438,5 @@ def test_constants_are_computed_as_the_reference_does(text: str) -> None:
     ],
 )
 def test_an_envelope_of_constants_that_no_payload_holds_is_refused(case: str, fields: FieldMap) -> None:
-    with pytest.raises(MappingError):
+    with pytest.raises(FindingError):
         constant(case, fields)

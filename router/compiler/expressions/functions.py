@@ -1,9 +1,8 @@
-"""The functions of the expression language: each declared once, with documentation, examples and implementation.
+"""The functions of the expression language: each declared once, with documentation and examples.
 
 The examples are tests (tests/compiler/test_expressions.py), and the reference page is generated from them. Each
 function has a rule that returns the kind of a call from its arguments, once their number and kinds are checked; it
-raises ValueError with a message if such a call can never succeed. An implementation raises MappingError for a value
-without a result.
+raises ValueError with a message if such a call can never succeed. `lowering/functions.py` has their operations.
 """
 
 from __future__ import annotations
@@ -31,100 +30,14 @@ from router.compiler.expressions.kinds import (
     within_64_bits,
 )
 from router.compiler.expressions.tree import Node, constant_of
-from router.errors import MappingError, NonFiniteError
 
 NS_PER_SECOND = 1_000_000_000
 NS_PER_MILLISECOND = 1_000_000
 FLOAT32_END = 3.4028235677973366e38
 """The smallest magnitude that does not round to a finite float32."""
 
-INT64_END = 1 << 63
-"""The first integer that does not fit 64 signed bits."""
-
 MOST_DIGITS = 17
 """Maximum decimals of text(): more do not distinguish doubles."""
-
-# implementations
-
-
-def round_half_even(x: float) -> int:
-    return _to_int(round, x)
-
-
-def truncate(x: float) -> int:
-    return _to_int(math.trunc, x)
-
-
-def floor(x: float) -> int:
-    return _to_int(math.floor, x)
-
-
-def ceil(x: float) -> int:
-    return _to_int(math.ceil, x)
-
-
-def _to_int(convert: Callable[[float], int], x: float) -> int:
-    if isinstance(x, int):
-        return x
-    if not math.isfinite(x):
-        raise NonFiniteError(f"{x} is not an integer")
-    return _within_64_bits(convert(x))
-
-
-def _within_64_bits(x: int) -> int:
-    if -INT64_END <= x < INT64_END:
-        return x
-    raise MappingError(f"{x} does not fit 64 bits")
-
-
-def clamp(x: float, low: float, high: float) -> float:
-    return low if x < low else high if x > high else x  # noqa: FURB136 - min() takes three times as long
-
-
-def wrap(x: int, low: int, high: int) -> int:
-    if low > high:
-        raise MappingError(f"the low bound {low} is above the high bound {high}")
-    return (x - low) % (high - low + 1) + low
-
-
-def atan2(y: float, x: float) -> float:
-    return _with_one_nan(math.atan2(y, x))
-
-
-def hypot(x: float, y: float) -> float:
-    return _with_one_nan(math.hypot(x, y))
-
-
-def _with_one_nan(x: float) -> float:
-    """Replace every NaN by the same one: in Python 3.10, the sign depends on the processor."""
-    return math.nan if x != x else x  # noqa: PLR0124 - NaN alone differs from itself
-
-
-def to_float32(x: float) -> float:
-    if math.isinf(x) or abs(x) < FLOAT32_END or math.isnan(x):
-        return float(x)
-    raise MappingError(f"{x} is too large for a float32")
-
-
-def seconds(time: int) -> float:
-    return float(time) / NS_PER_SECOND
-
-
-def time_from_seconds(x: float) -> int:
-    return _within_64_bits(_to_int(round, x * NS_PER_SECOND))
-
-
-def time_from_milliseconds(x: float) -> int:
-    return _within_64_bits(_to_int(round, x * NS_PER_MILLISECOND))
-
-
-def fixed(x: float, digits: int) -> str:
-    return f"{float(x):.{digits}f}"
-
-
-def strip(x: str) -> str:
-    return x.strip(" \t\n\v\f\r\0")
-
 
 # kinds of results
 
@@ -286,7 +199,6 @@ class Function:
     name: str
     parameters: tuple[Parameter, ...]
     result: Rule
-    implementation: Callable[..., object]
     summary: str
     examples: tuple[tuple[str, object], ...]
     variadic: bool = False
@@ -309,74 +221,72 @@ def _whole(name: str = "x") -> Parameter:
     return Parameter(name, (IntKind, EnumKind), "an integer")
 
 
-def _real(
-    implementation: Callable[..., float], summary: str, *examples: tuple[str, object], names: tuple[str, ...] = ("x",)
-) -> Function:
-    return Function(implementation.__name__, tuple(map(_number, names)), _double, implementation, summary, examples)
+def _real(name: str, summary: str, *examples: tuple[str, object], names: tuple[str, ...] = ("x",)) -> Function:
+    return Function(name, tuple(map(_number, names)), _double, summary, examples)
 
 
 _DECLARED = (
-    Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
-    Function("min", (_number("a"), _number("b")), _extreme(min), min,
+    Function("abs", (_number(),), _absolute, "The magnitude of a number.", (("abs(-3)", 3),)),
+    Function("min", (_number("a"), _number("b")), _extreme(min),
              "The smallest argument, or the smallest element of a list. An empty list has none: the message is "
              "dropped.",
              (("min(2, 1.5)", 1.5), ("min([3, 1, 2])", 1)), variadic=True, gives_an_argument=True,
              of_list=_extreme_of_list),
-    Function("max", (_number("a"), _number("b")), _extreme(max), max,
+    Function("max", (_number("a"), _number("b")), _extreme(max),
              "The largest argument, or the largest element of a list; an empty list drops the message.",
              (("max(2, 3, 1)", 3), ("max([0.5, 2])", 2.0)), variadic=True, gives_an_argument=True,
              of_list=_extreme_of_list),
-    Function("sum", (Parameter("x", (), "a list of numbers"),), _double, sum,
+    Function("sum", (Parameter("x", (), "a list of numbers"),), _double,
              "The sum of a list, added in order; 0 for an empty list.", (("sum([1, 2, 3])", 6), ("sum([1, 0.5])", 1.5)),
              of_list=_sum_of_list),
-    Function("round", (_number(),), _rounded(round), round_half_even,
+    Function("round", (_number(),), _rounded(round),
              "The nearest integer; halves round to even. NaN, infinities and results beyond 64 bits drop the message.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
-    Function("trunc", (_number(),), _rounded(math.trunc), truncate, "The integer part: rounds towards zero.",
+    Function("trunc", (_number(),), _rounded(math.trunc), "The integer part: rounds towards zero.",
              (("trunc(-2.7)", -2),)),
-    Function("floor", (_number(),), _rounded(math.floor), floor, "The largest integer <= x.", (("floor(-2.5)", -3),)),
-    Function("ceil", (_number(),), _rounded(math.ceil), ceil, "The smallest integer >= x.", (("ceil(2.1)", 3),)),
-    Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
+    Function("floor", (_number(),), _rounded(math.floor), "The largest integer <= x.", (("floor(-2.5)", -3),)),
+    Function("ceil", (_number(),), _rounded(math.ceil), "The smallest integer >= x.", (("ceil(2.1)", 3),)),
+    Function("clamp", (_number(), _number("low"), _number("high")), _clamped,
              "The number limited to two bounds, by default those of the integer field that it fills.",
              (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2, gives_an_argument=True),
-    Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped, wrap,
+    Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped,
              "The integer wrapped around between two bounds, by default those of the integer field that it fills.",
              (("wrap(256, 0, 255)", 0), ("wrap(-1, 0, 255)", 255), ("wrap(190, -180, 179)", -170)), optional=2),
-    _real(math.radians, "Degrees to radians.", ("radians(180)", math.pi)),
-    _real(math.degrees, "Radians to degrees.", ("degrees(0.0)", 0.0)),
-    _real(math.sqrt, "The square root. A negative number has none: the message is dropped.",
+    _real("radians", "Degrees to radians.", ("radians(180)", math.pi)),
+    _real("degrees", "Radians to degrees.", ("degrees(0.0)", 0.0)),
+    _real("sqrt", "The square root. A negative number has none: the message is dropped.",
           ("sqrt(9)", 3.0)),
-    _real(math.sin, "The sine of an angle in radians.", ("sin(0)", 0.0)),
-    _real(math.cos, "The cosine of an angle in radians.", ("cos(0)", 1.0)),
-    _real(math.tan, "The tangent of an angle in radians.", ("tan(0)", 0.0)),
-    _real(atan2, "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
+    _real("sin", "The sine of an angle in radians.", ("sin(0)", 0.0)),
+    _real("cos", "The cosine of an angle in radians.", ("cos(0)", 1.0)),
+    _real("tan", "The tangent of an angle in radians.", ("tan(0)", 0.0)),
+    _real("atan2", "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
           names=("y", "x")),
-    _real(hypot, "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), names=("x", "y")),
-    Function("float32", (_number(),), _always(FloatKind(32)), to_float32,
+    _real("hypot", "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), names=("x", "y")),
+    Function("float32", (_number(),), _always(FloatKind(32)),
              "The number as a float32; digits of a double or a large integer may be lost.", (("float32(0.5)", 0.5),)),
-    Function("float64", (_number(),), _always(FloatKind(64)), float,
+    Function("float64", (_number(),), _always(FloatKind(64)),
              "The number as a double; digits of a large integer may be lost.", (("float64(3)", 3.0),)),
     Function("int", (Parameter("x", (BoolKind, IntKind, EnumKind), "a bool, an integer or an enum"),),
-             _integer_or_bool, int, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
+             _integer_or_bool, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
     Function("str", (Parameter("x", (BoolKind, IntKind, EnumKind, StringKind), "an integer, an enum, a bool or text"),),
-             _always(StringKind()), str, "An integer, the number of an enum, or a bool (True, False) as text.",
+             _always(StringKind()), "An integer, the number of an enum, or a bool (True, False) as text.",
              (("'wheel_' + str(3)", "wheel_3"),)),
-    Function("text", (Parameter("x", Number, "a number", becomes=FloatKind(64)), _whole("digits")), _written, fixed,
+    Function("text", (Parameter("x", Number, "a number", becomes=FloatKind(64)), _whole("digits")), _written,
              "A number as text with `digits` decimals, a literal from 0 to 17.",
              (("text(2.675, 1)", "2.7"), ("text(3, 2)", "3.00"))),
-    Function("strip", (Parameter("x", (StringKind,), "a string"),), _always(StringKind()), strip,
+    Function("strip", (Parameter("x", (StringKind,), "a string"),), _always(StringKind()),
              "Text without NULs, spaces, tabs and line ends at its start and end. Firmware pads text of fixed "
              "length with NULs, which a ROS string cannot contain.",
              (("strip('  left ')", "left"), ("strip('a b')", "a b"))),
     Function("len", (Parameter("x", (StringKind,), "a list, a string or bytes"),), _always(UINT32),
-             len, "The number of elements of a list or bytes, or of characters of a string.", (("len([1, 2])", 2),),
+             "The number of elements of a list or bytes, or of characters of a string.", (("len([1, 2])", 2),),
              of_list=lambda _: UINT32),
-    Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)), seconds,
+    Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)),
              "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
-    Function("time_from_seconds", (_number(),), _always(TimeKind()), time_from_seconds,
+    Function("time_from_seconds", (_number(),), _always(TimeKind()),
              "Seconds since 1970 as a time, in 64-bit nanoseconds.",
              (("time_from_seconds(2)", 2_000_000_000),)),
-    Function("time_from_milliseconds", (_number(),), _always(TimeKind()), time_from_milliseconds,
+    Function("time_from_milliseconds", (_number(),), _always(TimeKind()),
              "Milliseconds since 1970 as a time, in 64-bit nanoseconds.",
              (("time_from_milliseconds(1500)", 1_500_000_000),)),
 )  # fmt: skip

@@ -102,7 +102,7 @@ _RELATIONS: Mapping[type[ast.cmpop], Relation] = {
     ast.Gt: Relation.MORE,
     ast.GtE: Relation.MORE_OR_EQUAL,
 }
-COMPUTED: Mapping[Operator, Callable[[Any, Any], Any]] = {
+_COMPUTED: Mapping[Operator, Callable[[Any, Any], Any]] = {
     Operator.ADD: operator.add,
     Operator.SUBTRACT: operator.sub,
     Operator.MULTIPLY: operator.mul,
@@ -185,7 +185,7 @@ def folded(made: Binary) -> Binary | Constant:
     if left is None or right is None:
         return made
     try:
-        value = COMPUTED[made.operator](left, right)
+        value = _COMPUTED[made.operator](left, right)
     except ArithmeticError as error:
         raise ExpressionError(made.span, Code.OUT_OF_RANGE, str(error)) from None
     if isinstance(value, float) and not math.isfinite(value):
@@ -199,7 +199,7 @@ def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:
     """Return integers that include the smallest and the largest value of `left op right`."""
     bounds, (low, high) = (left.low, left.high), (right.low, right.high)
     if op in _MONOTONE:
-        return [COMPUTED[op](x, y) for x in bounds for y in (low, high)]
+        return [_COMPUTED[op](x, y) for x in bounds for y in (low, high)]
     if op is Operator.POWER:
         return [left.low**high, left.high**high, *[0] * (left.low < 0 < left.high)]
     if op is Operator.MODULO:  # has the divisor's sign

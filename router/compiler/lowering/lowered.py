@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from router.compiler.lowering.layout import Layout
+from router.compiler.lowering.messages import Place
 from router.compiler.lowering.operations import Routine
 from router.declared import Scalar
 
@@ -88,6 +89,15 @@ class LoweredCondition:
 
     routine: Routine
     layout: Layout
+
+
+@dataclass(frozen=True, slots=True)
+class LoweredConstant:
+    """The routine of a message that reads no other one, with the place of each operation."""
+
+    routine: Routine
+    layout: Layout
+    places: tuple[Place, ...]
 
 
 @dataclass(frozen=True, slots=True)

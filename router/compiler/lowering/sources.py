@@ -16,6 +16,7 @@ from router.compiler.lowering.expressions import Lowering
 from router.compiler.lowering.layout import Layout, protobuf_layout
 from router.compiler.lowering.lowered import (
     LoweredCollect,
+    LoweredConstant,
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
@@ -195,6 +196,21 @@ class RosMessage(_Source):
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all routines made so far. Raises TooLargeError."""
         return _small(cdr_layout(self.temporaries, self.root, self.elements, span), span)
+
+
+class Constants(_Source):
+    """No message: a deadman sends constants."""
+
+    def __init__(self) -> None:
+        super().__init__(Section(MessageType("nothing"), None))
+
+    def lowered(self, plan: Record, case: PayloadCase | None) -> LoweredConstant:
+        """Lower the envelope of a payload, or a ROS message if `case` is None. Raises TooLargeError."""
+        lowering = self.lowering()
+        placed = protobuf_message(lowering, plan, case) if case is not None else cdr_message(lowering, plan)
+        _require_small([(operation, place.span) for operation, place in placed])
+        layout = _small(cdr_layout(self.temporaries, self.root, self.elements, plan.span), plan.span)
+        return LoweredConstant(tuple(each for each, _ in placed), layout, tuple(place for _, place in placed))
 
 
 def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
