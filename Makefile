@@ -26,8 +26,8 @@ setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; re
 tools: setup
 	@test -x .venv/bin/pytest || { echo "make: tools for developers are missing: run 'make setup DEV=yes'" >&2; exit 1; }
 
-install-service:  ## install the router as a systemd service and start it, with sudo; TABLE=... for another table
-	@deploy/install-service.sh $(TABLE)
+install-service:  ## install router and gateways as systemd services, with sudo; TABLE=... GATEWAYS=...|none for others
+	@deploy/install-service.sh $(or $(TABLE),$(if $(GATEWAYS),routes/rover-router.yaml)) $(GATEWAYS)
 
 # By file, because the tests of a file share what they start, in the order of tests/conftest.py. Many tests wait, so there
 # may be more processes than cores. If a worker dies, the run ends: pytest-xdist would wait forever for its remaining

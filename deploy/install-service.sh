@@ -1,12 +1,15 @@
 #!/usr/bin/env bash
-# Installs the router of this checkout as a systemd service, and starts it. `make install-service` runs it; needs root.
+# Installs router and gateways of this checkout as systemd services, and starts them. `make install-service` runs it;
+# needs root.
 #
-#   deploy/install-service.sh [TABLE]     the default table is routes/rover.yaml; run it again after changing the
-#                                         address or interface of a listener, `record.directory`, or the path of
-#                                         the checkout
+#   deploy/install-service.sh [TABLE [GATEWAYS]]
 #
-# It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, creates /etc/default/rover-router if
-# it does not exist, and adds the user rover-router. Listeners on an interface, for example wg0, get a unit
+# TABLE is the router's, at first routes/rover-router.yaml. GATEWAYS is the table of a second service, at first
+# routes/rover-gateways.yaml; `none` for no second service. If TABLE has gateways itself, there is none either. Run it
+# again after changing the address or interface of a listener, `record.directory`, or the path of the checkout.
+#
+# It writes rover-router.service, .socket and -hold.service and rover-gateways.service to /etc/systemd/system, creates
+# /etc/default/rover-router if it does not exist, and adds the user rover-router. Listeners on an interface, for example wg0, get a unit
 # rover-router-wg0.socket, and the interface's device unit a shorter timeout. docs/guides/deploy.md describes how to
 # operate and remove the service.
 set -euo pipefail
@@ -33,38 +36,50 @@ check_place "$root"
 command -v systemctl >/dev/null || die "this computer has no systemd"
 
 chosen=
+gateways=
 if [ $# -gt 0 ]; then
   chosen=$(realpath -e "$1") || die "there is no table $1"
   check_place "$chosen"
+fi
+if [ $# -gt 1 ]; then
+  gateways=none
+  [ "$2" = none ] || gateways=$(realpath -e "$2") || die "there is no table $2"
+  check_place "$gateways"
 fi
 
 echo "install-service: runs code of $root as root, which '$(stat -c %U "$root")' can change: .venv/env.sh," \
   ".venv/bin/python and router/; it also runs $settings; the service runs as '$user'"
 
-# What the units need from the table: lines "socket ADDRESS INTERFACE" (- for none), "write FOLDER" and "read FOLDER".
-# Findings go to stderr.
-facts=$(
-  set -a
-  RECORDINGS=/var/lib/$user  # as in the unit; the settings may change it
-  ROUTER_TABLE=$root/routes/rover.yaml
-  # shellcheck disable=SC1090
-  if [ -e "$settings" ]; then . "$settings"; fi
-  ROUTER_TABLE=${chosen:-$ROUTER_TABLE}
+set -a
+RECORDINGS=/var/lib/$user  # as in the unit; the settings may change it
+ROUTER_TABLE=$root/routes/rover-router.yaml
+GATEWAYS_TABLE=$root/routes/rover-gateways.yaml
+# shellcheck disable=SC1090
+if [ -e "$settings" ]; then . "$settings"; fi
+ROUTER_TABLE=${chosen:-$ROUTER_TABLE}
+GATEWAYS_TABLE=${gateways:-${GATEWAYS_TABLE:-none}}
+set +a
+
+# Print what a unit needs from its TABLE: lines "socket ADDRESS INTERFACE" (- for none), "write FOLDER", "read FOLDER",
+# and "gateways" if it has some. Findings go to stderr.
+facts_of() {
   set +u  # ROS's script reads variables that nobody set
   # shellcheck disable=SC1091
   . "$root/.venv/env.sh"
   set -u
-  "$root/.venv/bin/python" - "$root" <<'END'
-import os, sys
+  "$root/.venv/bin/python" - "$root" "$1" <<'END'
+import sys
 from pathlib import Path
 from router.cli.findings import print_findings
 from router.compiler import check_table
 
-checked = check_table(Path(os.environ["ROUTER_TABLE"]))
+checked = check_table(Path(sys.argv[2]))
 print_findings(checked.diagnostics, sys.stderr)
 if checked.program is None:
     sys.exit(78)
 table = checked.program.table
+if table.gateways:
+    print("gateways")
 for listener in checked.program.listeners:
     print("socket", listener.address.value, listener.interface or "-")
 if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):
@@ -74,31 +89,50 @@ for folder in sorted(read):
     if folder.parts[:2] in (("/", "home"), ("/", "root")) and read.isdisjoint(folder.parents):
         print("read", folder)
 END
-) || case $? in
-  78) die "nothing was changed: the table has errors" ;;
-  *) die "nothing was changed: the table could not be checked" ;;
-esac
+}
+
+unusable() {  # STATUS of facts_of
+  case $1 in
+    78) die "nothing was changed: the table has errors" ;;
+    *) die "nothing was changed: the table could not be checked" ;;
+  esac
+}
+
+facts=$(facts_of "$ROUTER_TABLE") || unusable $?
+if grep -q '^gateways' <<<"$facts"; then
+  [ "${gateways:-none}" = none ] || die "nothing was changed: $ROUTER_TABLE has gateways itself: leave out $gateways," \
+    "or name a table without gateways, such as routes/rover-router.yaml"
+  echo "install-service: the router also runs the gateways of $ROUTER_TABLE; for a process of their own, choose" \
+    "routes/rover-router.yaml"
+  GATEWAYS_TABLE=none
+fi
+if [ "$GATEWAYS_TABLE" != none ]; then
+  gateway_facts=$(facts_of "$GATEWAYS_TABLE") || unusable $?
+fi
 
 id "$user" >/dev/null 2>&1 || useradd --system --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin "$user"
 
 if [ ! -e "$settings" ]; then
   cat >"$settings" <<END
-# Environment of rover-router.service, read at each start. After changing ROUTER_TABLE, or the addresses of its
-# listeners, run deploy/install-service.sh again.
-ROUTER_TABLE=$root/routes/rover.yaml
+# Environment of rover-router.service and rover-gateways.service, read at each start. After changing a table, or the
+# addresses of its listeners, run deploy/install-service.sh again.
+ROUTER_TABLE=$root/routes/rover-router.yaml
+GATEWAYS_TABLE=$root/routes/rover-gateways.yaml
 ROS_DOMAIN_ID=0
 #ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
 #BASESTATION=192.168.0.10:9000
 END
 fi
-if [ -n "$chosen" ]; then
-  if grep -q '^ROUTER_TABLE=' "$settings"; then
-    sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$chosen|" "$settings"
+remember() {  # VARIABLE VALUE
+  if grep -q "^$1=" "$settings"; then
+    sed -i "s|^$1=.*|$1=$2|" "$settings"
   else
     sed -i '$a\' "$settings"  # ends the last line
-    echo "ROUTER_TABLE=$chosen" >>"$settings"
+    echo "$1=$2" >>"$settings"
   fi
-fi
+}
+[ -z "$chosen" ] || remember ROUTER_TABLE "$chosen"
+[ -z "$gateways" ] || remember GATEWAYS_TABLE "$gateways"
 
 # A socket unit has one BindToDevice=, and needs a service of its own, so each interface has a pair of units.
 new=$(mktemp -d)
@@ -128,12 +162,22 @@ done < <(printf '%s\n' "$facts" | awk '$1 == "socket" { print $3 == "-" ? "" : $
 sed -e "s|/opt/rover-router|$root|g; s|^Sockets=.*|Sockets=${sockets[*]}|" "$root/deploy/systemd/rover-router.service" \
   >"$new/rover-router.service"
 
-# Home folders are hidden from the service, except for the paths that it needs.
-mkdir -p "$units/rover-router.service.d"
-{
-  printf '# Written by deploy/install-service.sh.\n[Service]\n'
-  printf '%s\n' "$facts" | sed -n 's/^read /BindReadOnlyPaths=/p; s/^write /BindPaths=/p'
-} >"$units/rover-router.service.d/places.conf"
+# Home folders are hidden from a service, except for the paths that it needs.
+open_places() {  # SERVICE FACTS
+  mkdir -p "$units/$1.d"
+  {
+    printf '# Written by deploy/install-service.sh.\n[Service]\n'
+    printf '%s\n' "$2" | sed -n 's/^read /BindReadOnlyPaths=/p; s/^write /BindPaths=/p'
+  } >"$units/$1.d/places.conf"
+}
+open_places rover-router.service "$facts"
+if [ "$GATEWAYS_TABLE" != none ]; then
+  open_places rover-gateways.service "$gateway_facts"
+  sed "s|/opt/rover-router|$root|g" "$root/deploy/systemd/rover-gateways.service" >"$new/rover-gateways.service"
+elif [ -e "$units/rover-gateways.service" ]; then  # of an earlier installation
+  systemctl disable --quiet --now rover-gateways.service
+  rm -r "$units"/rover-gateways.service{,.d}
+fi
 printf '%s\n' "$facts" | sed -n 's/^write //p' | while read -r folder; do
   [ -d "$folder" ] || install -d -o "$user" -g "$user" "$folder"
 done
@@ -150,6 +194,10 @@ done
 install -m 644 "$new"/* "$units"
 systemctl daemon-reload
 if [ $same_sockets = no ]; then systemctl stop rover-router.service "${sockets[@]}"; fi
-systemctl enable --quiet rover-router.service
-systemctl restart rover-router.service || die "the service did not start; see: journalctl -u rover-router -e"
-echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"
+start() {  # SERVICE
+  systemctl enable --quiet "$1.service"
+  systemctl restart "$1.service" || die "the service did not start; see: journalctl -u $1 -e"
+  echo "install-service: $1 is running; see: systemctl status $1, journalctl -u $1 -f"
+}
+start rover-router
+[ "$GATEWAYS_TABLE" = none ] || start rover-gateways

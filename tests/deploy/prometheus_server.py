@@ -20,18 +20,22 @@ from tests.ports import free_port
 
 PROGRAM = shutil.which("prometheus")
 SCRAPED = "127.0.0.1:9108"
-"""The targets in prometheus.yml."""
+OF_GATEWAYS = "127.0.0.1:9109"
+"""The targets in prometheus.yml: of the router's job, and of the gateways'."""
 
 
 class PrometheusServer:
-    """Scrapes `router` twice a second and stores its data in `folder`."""
+    """Scrapes `router`, which also runs the gateways, twice a second and stores its data in `folder`."""
 
     def __init__(self, folder: Path, router: str) -> None:
         assert PROGRAM
         self.address = f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
         config = folder / "config"
         shutil.copytree(ROOT / "deploy/prometheus", config)
-        _patch(config / "prometheus.yml", {SCRAPED: router, "_interval: 5s": "_interval: 500ms"})
+        _patch(
+            config / "prometheus.yml",
+            {SCRAPED: router, f'- targets: ["{OF_GATEWAYS}"]': "", "_interval: 5s": "_interval: 500ms"},
+        )
         with (folder / "prometheus.log").open("w") as log:
             self._process = subprocess.Popen(
                 [

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from router.compiler import check_table
-from tests.deploy.prometheus_server import SCRAPED
+from tests.deploy.prometheus_server import OF_GATEWAYS, SCRAPED
 from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent.parent
@@ -67,6 +67,17 @@ def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
     assert "/ready" in code
 
 
+def test_gateways_are_a_service_of_another_user_with_a_health_check_of_their_own() -> None:
+    router, gateways = (COMPOSE["services"][name] for name in ("router", "gateways"))
+    assert f"ROUTER_METRICS={OF_GATEWAYS}" in gateways["environment"]
+    assert gateways["image"] == router["image"]
+    assert gateways["user"] not in re.findall("^USER (.+)$", DOCKERFILE, re.MULTILINE)
+    assert not any("state" in mounted or "recordings" in mounted for mounted in gateways["volumes"])
+    domain = {"ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"}
+    assert domain < {*router["environment"]}
+    assert domain < {*gateways["environment"]}
+
+
 @pytest.mark.parametrize("name", COMPOSE["services"])
 def test_a_service_uses_the_hosts_network_and_mounts_what_there_is(name: str) -> None:
     service = COMPOSE["services"][name]
@@ -75,7 +86,8 @@ def test_a_service_uses_the_hosts_network_and_mounts_what_there_is(name: str) ->
     for mounted in service["volumes"]:
         source = mounted.split(":")[0]
         assert (FOLDER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"]
-    assert "build" in service or re.fullmatch(r"\$\{[A-Z]+_IMAGE:-\S+:v?\d+\.\d+\.\d+\}", service["image"])
+    of_build = service["image"] == COMPOSE["services"]["router"]["image"]
+    assert of_build or re.fullmatch(r"\$\{[A-Z]+_IMAGE:-\S+:v?\d+\.\d+\.\d+\}", service["image"])
     assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
     assert service["security_opt"] == ["no-new-privileges:true"]
 

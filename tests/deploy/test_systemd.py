@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "deploy" / "systemd"
-NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service")
+NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service", "rover-gateways.service")
 MOST_EXPOSED = 2.0
 ENVIRONMENT = f". {ROOT}/.venv/env.sh"
 ROUTER = f"{ROOT}/.venv/bin/router"
@@ -39,7 +39,7 @@ def analyze(*arguments: object) -> str:
     return finished.stdout + finished.stderr
 
 
-@pytest.mark.parametrize("name", ["rover-router.service", "rover-router-hold.service"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name.endswith(".service")])
 def test_a_service_may_do_little(name: str) -> None:
     out = analyze("security", "--offline=true", "--no-pager", name)
     exposed = re.search(rf"Overall exposure level for {name}: ([\d.]+)", out)
@@ -217,6 +217,56 @@ def test_a_table_with_errors_is_not_installed(running: Machine) -> None:
     assert "bad.yaml:1:1: error[missing-key]" in finished.stderr
     running.shell("cmp /etc/default/rover-router /opt/settings")
     assert running.state() == "active"
+
+
+@pytest.fixture
+def apart(running: Machine) -> Iterator[Machine]:
+    """The machine with the gateways of the table in a service of their own."""
+    alone = f"version: 1\nextends: {SIM}\ngateways: {{dashboard: {{ignore: gateways.yaml has it}}}}\n"
+    gateways = """version: 1
+node: {name: rover_gateways}
+http: {address: 127.0.0.1:29109}
+gateways: {dashboard: {transport: {websocket: 127.0.0.1:28765}}}
+"""
+    running.shell(f"printf '%s' '{alone}' > /opt/alone.yaml; printf '%s' '{gateways}' > /opt/gateways.yaml")
+    running.shell(f"{ROOT}/deploy/install-service.sh /opt/alone.yaml /opt/gateways.yaml")
+    yield running
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}; sed -i /^GATEWAYS_TABLE=/d /etc/default/rover-router")
+    assert running.run("systemctl", "cat", "rover-gateways", check=False).returncode != 0
+
+
+def test_gateways_run_in_a_process_that_can_do_nothing_to_the_router(apart: Machine) -> None:
+    assert apart.state() == apart.state("rover-gateways") == "active"
+    assert apart.show("UnitFileState", "rover-gateways") == "enabled"
+    pids = {unit: apart.show("MainPID", unit) for unit in ("rover-router", "rover-gateways")}
+    assert f"pid={pids['rover-gateways']}," in apart.shell("ss -ltnpH 'sport = :28765'")
+    users = {unit: apart.shell(f"stat -c %u /proc/{pid}").strip() for unit, pid in pids.items()}
+    assert "0" not in users.values()
+    assert users["rover-router"] != users["rover-gateways"]
+    own = users["rover-gateways"]
+    as_gateways = f"HOME=/tmp setpriv --reuid={own} --regid={own} --clear-groups {ROUTER}"
+    assert "as the router's user" in apart.shell(f"{as_gateways} reload -t /opt/alone.yaml", check=False)
+    apart.run("systemctl", "reload", "rover-gateways")
+    assert "gateways.yaml" in apart.journal("rover-gateways").rpartition("reload")[0]
+
+
+def test_gateways_that_are_killed_come_back_and_the_router_runs_on(apart: Machine) -> None:
+    before = {unit: apart.show("MainPID", unit) for unit in ("rover-router", "rover-gateways")}
+    apart.shell("systemctl kill --signal=KILL --kill-whom=main rover-gateways")
+    apart.wait_for(
+        f"[ $(systemctl show -P MainPID rover-gateways) != {before['rover-gateways']} ]"
+        " && systemctl is-active -q rover-gateways"
+    )
+    assert (apart.state(), apart.show("MainPID")) == ("active", before["rover-router"])
+
+
+def test_one_gateway_is_not_in_two_services(running: Machine) -> None:
+    finished = running.run(f"{ROOT}/deploy/install-service.sh", SIM, "/dev/null", check=False)
+    assert finished.returncode == 1
+    assert finished.stderr == (
+        f"install-service: nothing was changed: {SIM} has gateways itself: leave out /dev/null,\n"
+        "install-service: or name a table without gateways, such as routes/rover-router.yaml\n"
+    )
 
 
 def test_no_other_computer_is_looked_for_whatever_is_sourced(running: Machine) -> None:

@@ -78,6 +78,7 @@ clean() {
 trap clean EXIT
 cp -r tests/rover/routes deploy "$work"
 cp -r tests/rover/protos "$work"
+export ROUTER_TABLE=routes/rover.yaml  # one process with gateways: the tests' rover has no other table
 compose=(podman-compose -f "$work/deploy/container/compose.yaml")
 
 start() {  # [COMPOSE FILE...]
