@@ -29,9 +29,10 @@ find_isolation() {  # print the command that disconnects the network; nothing if
 }
 
 check_wheel() {  # PYTHON FOLDER: install the wheel into a new environment and try it
-  local requirement=$wheel
+  local extras=gateways,foxglove,recording
   # ROS has wheels for x86_64 only.
-  if [ "$(uname -m)" = x86_64 ]; then requirement+='[ros]'; fi
+  if [ "$(uname -m)" = x86_64 ]; then extras+=,ros; fi
+  local requirement="$wheel[$extras]"
   mkdir -p "$2/home"
   "$1" -m venv "$2/venv"
   # With PEP 517, because pip of Python 3.10 and 3.11 cannot build empy with its setup.py unless `wheel` is installed.

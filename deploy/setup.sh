@@ -124,17 +124,17 @@ make_environment() {
 }
 
 install_packages() {
-  local extras=ros constraints=$root/constraints.txt
+  local extras=ros,gateways,foxglove,recording constraints=$root/constraints.txt
   if [ -n "$ros" ]; then
-    extras=
+    extras=${extras#ros,}
     # The distribution's rclpy is built for the distribution's numpy.
     constraints=$made/constraints.txt
     grep -v '^numpy==' "$root/constraints.txt" >"$constraints"
   fi
-  if [ "$dev" = yes ]; then extras=${extras:+$extras,}dev; fi
+  if [ "$dev" = yes ]; then extras=$extras,dev; fi
   # Unlike pip's option, the variable also applies to the packages that pip needs to build this one.
   PIP_CONSTRAINT=$constraints PIP_DISABLE_PIP_VERSION_CHECK=1 \
-    "$python" -m pip install --no-input --editable "$root${extras:+[$extras]}"
+    "$python" -m pip install --no-input --editable "$root[$extras]"
 }
 
 build_carrier() {

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from router.app.plane import Built, Opened, Plane
 from router.app.sockets import KernelDrops, SocketChange, Sockets
 from router.carrier.state import State
+from router.compiler.extras import missing_extras
 from router.compiler.metrics import PUBLISHER, SHARES_NODE, SHARES_TOPIC, SUBSCRIBER
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
@@ -144,6 +145,8 @@ class Runtime:
         """
         if self._unfinished and self.plane.wait_until_adopted():
             self._close_unfinished()  # before `program` opens the same addresses or topics
+        for missing in missing_extras(program.table):
+            raise missing
         with ExitStack() as undo:
             _check_ports(program, os.environ)
             if self._ros is None and _needs_ros(program):

@@ -192,9 +192,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             _leave(sys.stdout)
             print(f"router {_verb(arguments) or ''}".rstrip() + f": stdout: {error.strerror}", file=sys.stderr)
             return UNWRITTEN
-        if isinstance(error, ImportError) and "declared" in error.msg:
-            what = f"router {_verb(arguments)}: router/declared.py does not match the headers of the carrier"
-            print(with_help(what, "run 'make setup'"), file=sys.stderr)
+        if isinstance(error, ImportError) and (problem := _import_problem(error)):
+            print(with_help(f"router {_verb(arguments)}: {problem.what}", problem.hint), file=sys.stderr)
             return BAD_TABLE
         # Each of these errors can mean that memory could not be allocated.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
@@ -211,6 +210,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         os._exit(NOT_NOW)  # threads that did start would keep the process alive
     return code
+
+
+def _import_problem(error: ImportError) -> ConfigurationError | None:
+    """Return the error to show for a failed import; None if it has another cause than the installation."""
+    from router.compiler.extras import extra_of, missing_extra
+
+    if "declared" in error.msg:
+        return ConfigurationError("router/declared.py does not match the headers of the carrier", "run 'make setup'")
+    if is_shortage(error) or (extra := extra_of(error.name or "")) is None:
+        return None
+    return missing_extra(f"this needs a Python package that is not installed: {error.name}", extra)
 
 
 def _leave(*streams: TextIO) -> None:

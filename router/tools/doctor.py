@@ -20,6 +20,7 @@ from router.tools.doctor_checks import (
     carrier,
     clock,
     endpoints,
+    extras,
     fine,
     listeners,
     open_domain,
@@ -47,6 +48,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
         return
     running = _health(program)
     yield from carrier()
+    yield from extras(program)
     yield from (found := [*ros(program)])
     if running is None and all(each.grade is Grade.FINE for each in found):
         yield from ros_peers(program)
@@ -71,7 +73,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     needed = [_table(checked)]
     program = checked.program
     if program is not None:
-        needed += [carrier(), ros(program), ports(program, running=False, with_listeners=False)]
+        needed += [carrier(), extras(program), ros(program), ports(program, running=False, with_listeners=False)]
         needed += [recordings(program, running=False), ros_ports(program, variables)]
     problems = [result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM]
     yield from problems

@@ -18,13 +18,13 @@ from time import monotonic
 from typing import NamedTuple
 
 from router.assets import asset
+from router.compiler.extras import missing_extras, missing_modules
 from router.compiler.program import Program
 from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable
-from router.recording.writer import recording_sizes
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
 from router.table.model import Endpoint, Listener, Transport, bound_to
@@ -102,7 +102,7 @@ def recordings(program: Program, *, running: bool) -> Iterator[CheckResult]:
     A `running` router may have another user, and reports itself what it cannot write.
     """
     settings = program.table.record
-    if settings is None:
+    if settings is None or missing_modules("recording"):  # which `extras` reports
         return
     if os.path.islink(settings.directory) and not os.path.exists(settings.directory):  # noqa: PTH110, PTH114 - as below
         what = f"{settings.directory} is a link that leads nowhere"
@@ -131,6 +131,8 @@ def recordings(program: Program, *, running: bool) -> Iterator[CheckResult]:
             "chown it, or give `record` another directory; for a service, then run deploy/install-service.sh again",
         )
         return
+    from router.recording.writer import recording_sizes  # of an extra
+
     kept = sum(recording_sizes(directory, program.table.path.stem).values())
     free = shutil.disk_usage(there).free
     if settings.continuous and kept + free < settings.retention:
@@ -391,6 +393,11 @@ def _request(identity: int) -> bytes:
     """Return an echo request with its checksum, which raw sockets need."""
     total = (_ECHO << 8) + identity + 1
     return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
+
+
+def extras(program: Program) -> Iterator[CheckResult]:
+    for each in missing_extras(program.table):
+        yield problem("Python", each.what, each.hint)
 
 
 def ros(program: Program) -> Iterator[CheckResult]:

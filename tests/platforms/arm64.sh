@@ -22,7 +22,7 @@ say "install, on $(uname -m), $(python3 -V)"
 export PIP_CONSTRAINT=$PWD/checkout/constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_COMPILE=1
 pip wheel -q --no-deps -w dist ./checkout
 ls dist
-pip install -q dist/*.whl
+pip install -q "$(echo dist/*.whl)[gateways,foxglove,recording]"
 du -sh venv
 checkout/tests/platforms/installed.sh venv/bin/router
 say "the carrier: tests"
