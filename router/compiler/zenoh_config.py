@@ -7,11 +7,16 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-import zenoh
-
+from router.compiler.extras import missing_extra
 from router.errors import Code, Diagnostic, did_you_mean
 from router.table.model import Gateway, Networks, ZenohConfig
 from router.table.nodes import Path
+
+try:
+    import zenoh
+except ModuleNotFoundError as error:
+    what = f"a Zenoh gateway needs a Python package that is not installed: {error.name}"
+    raise missing_extra(what, "gateways") from error
 
 OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
 """Keys of the library that tables set beside `config`, with their names in tables."""

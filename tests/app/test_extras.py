@@ -101,6 +101,14 @@ def test_doctor_says_that_it_would_not_start(bare: Environment, tmp_path: Path, 
     assert "Traceback" not in finished.stderr
 
 
+def test_a_zenoh_gateway_cannot_be_checked_without_zenoh(bare: Environment, tmp_path: Path) -> None:
+    zenoh = GATEWAY.replace('websocket: "127.0.0.1:PORT"', "zenoh: {key: rover, config: {scouting: {}}}")
+    finished = bare.router(tmp_path, "validate", table(tmp_path, zenoh))
+    assert finished.returncode == BAD_TABLE
+    assert "a Zenoh gateway needs a Python package that is not installed: zenoh\nhelp: run " in finished.stderr
+    assert "Traceback" not in finished.stderr
+
+
 def test_a_table_that_needs_none_runs_without_them(bare: Environment, tmp_path: Path) -> None:
     name = table(tmp_path, UDP)
     assert bare.router(tmp_path, "validate", name).returncode == 0
