@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -15,7 +16,7 @@ import pytest
 
 from router.compiler.extras import EXTRAS, extra_of
 from tests.ports import free_port
-from tests.routers import ROOT
+from tests.routers import ROOT, log_until_started
 from tests.tables import PROTOS
 
 BAD_TABLE = 78
@@ -119,21 +120,26 @@ def test_a_table_that_needs_none_runs_without_them(bare: Environment, tmp_path: 
     )
     finished = bare.router(tmp_path, "test", name)
     assert finished.returncode == 0, finished.stdout + finished.stderr
+
+
+def test_a_running_router_keeps_its_table_if_the_new_one_needs_a_missing_extra(
+    bare: Environment, tmp_path: Path
+) -> None:
+    path = tmp_path / table(tmp_path, UDP)
     process = subprocess.Popen(
-        [bare.python, "-m", "router", "run", name],
-        cwd=tmp_path,
+        [bare.python, "-m", "router", "run", "--no-cache", path],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stderr=subprocess.PIPE,
         text=True,
     )
     with process:
         assert process.stderr is not None
-        log = []
-        for line in process.stderr:
-            log.append(line)
-            if "router started" in line:
-                process.terminate()
-    assert "router started" in "".join(log)
+        log_until_started(process.stderr)
+        path.write_text(path.read_text() + GATEWAY.partition("\n")[2].replace("PORT", str(free_port())))
+        process.send_signal(signal.SIGHUP)
+        reload = next(line for line in process.stderr if '"result"' in line)
+        process.terminate()
+    assert "a gateway needs Python packages that are not installed: backports.zstd, msgspec" in reload
     assert process.returncode == 0
 
 
