@@ -15,10 +15,11 @@ from typing import Any
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from tests.acceptance.gateway_clients import Dashboard, repeating
+from tests.acceptance.gateway_clients import Dashboard
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import BARE, RouterProcess, Site, site, wait_until
 from tests.ports import free_port
+from tests.repeating import repeating
 
 BOARDS = {"driving_board": "127.0.0.222", "arm_board": "127.0.0.40"}
 ROUTES = """
