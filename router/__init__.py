@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if _verb(arguments) != "run":  # `run` sets up its process itself
                 gc.set_threshold(_UNTIL_COLLECTED)
             elif argv is None and NO_CACHE not in arguments:
-                from router.kept.head_start import begin
+                from router.startup_image.head_start import begin
 
                 ending.callback(begin().close)  # if the verb fails before it takes over the head start
             from router.cli import main as run_verb  # once signals are blocked, as this takes up to 1 s

@@ -28,21 +28,23 @@ IMPORTS = {
     "values": "errors types",
     "compiler": "declared errors inputs assets lean library table types",
     "datagrams": "declared errors table types",
+    "image": LANGUAGE,
     "net": f"{GROUND} {LANGUAGE} datagrams",
-    "carrier": f"{GROUND} {LANGUAGE} datagrams net",
-    "kept": f"{GROUND} {LANGUAGE} datagrams net carrier",
+    "carrier": f"{GROUND} {LANGUAGE} datagrams image net",
+    "startup_image": f"{GROUND} {LANGUAGE} datagrams image net carrier",
     "ros": f"{GROUND} {LANGUAGE}",
-    "gateway": f"{GROUND} {LANGUAGE} datagrams net carrier ros",
+    "gateway": f"{GROUND} {LANGUAGE} datagrams image net carrier ros",
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
-    "rehearsal": f"{LANGUAGE} values datagrams carrier recording",
-    "tools": f"{GROUND} {LANGUAGE} values datagrams net carrier ros gateway recording observe rehearsal",
-    "app": f"{GROUND} {LANGUAGE} values datagrams net carrier kept ros gateway recording observe",
-    "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools carrier kept app",
+    "rehearsal": f"{LANGUAGE} values datagrams image carrier recording",
+    "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal",
+    "app": f"{GROUND} {LANGUAGE} values datagrams image net carrier startup_image ros gateway recording observe",
+    "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools image carrier"
+    " startup_image app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"declared", "errors", "lean", "library", "table", "types", "values", "compiler", "datagrams"}
+PURE = {"declared", "errors", "lean", "library", "table", "types", "values", "compiler", "datagrams", "image"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

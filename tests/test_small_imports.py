@@ -37,19 +37,21 @@ def imported(script: str) -> set[str]:
         ("from router.log import logger, FloodLog; FloodLog()", LOG),
         ("import router.net.sockets", {*LOG, *NET}),
         (
-            "from router import library; from router.carrier import ring, threads, carrier, sender; library.library()",
+            "from router.library import library; import router.carrier.forwarding_threads, router.carrier.sender; library()",
             {
                 "router.carrier", "router.library", "router.carrier.ring", "router.carrier.threads",
-                "router.carrier.carrier", "router.carrier.sender", *GROUND, *NET,
+                "router.carrier.forwarding_threads", "router.carrier.sender", *GROUND, *NET,
             },
         ),
         (
-            "import router.kept.head_start",
+            "import router.startup_image.head_start",
             {
                 "router.carrier", "router.library", "router.carrier.ring", "router.carrier.threads",
-                "router.carrier.carrier", "router.carrier.sender", "router.carrier.deadmen", "router.carrier.deferrals",
-                "router.carrier.forwarding", "router.carrier.names", "router.carrier.state", "router.inputs",
-                "router.kept", "router.kept.store", "router.kept.head_start", *GROUND, *NET,
+                "router.carrier.forwarding_threads", "router.carrier.sender", "router.carrier.deadmen",
+                "router.carrier.owned",
+                "router.carrier.forwarding", "router.carrier.loading", "router.image", "router.image.image",
+                "router.image.names", "router.inputs",
+                "router.startup_image", "router.startup_image.store", "router.startup_image.head_start", *GROUND, *NET,
             },
         ),
     ],

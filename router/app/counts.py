@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import cast
 
+from router.app.change import Change
 from router.carrier.forwarding import MOST_COUNTERS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
@@ -43,8 +44,11 @@ class ThreadCounts:
         indexes = [index for series, index in self.counters.series() if series.metric == metric]
         return sum(counts[index] for counts in self.lists for index in indexes)
 
-    def make_room(self, counters: Counters) -> None:
-        """Make room for the counts of `counters`, which extend the present ones. Raises ConfigurationError."""
+    # adoption of another program
+
+    def prepare(self, change: Change) -> None:
+        """Make room for its counts. Raises ConfigurationError."""
+        counters = change.program.counters
         if counters.size > MOST_COUNTERS:
             raise ConfigurationError(
                 f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}"
@@ -55,11 +59,14 @@ class ThreadCounts:
             for run in new:  # a program that was abandoned may have counted there
                 counts[run] = [0] * (run.stop - run.start)
 
-    def replace(self, counters: Counters) -> None:
-        """Adopt `counters`, once no thread uses the earlier ones."""
-        counters.settle(self.lists)
-        self.adopt(counters)
+    def undo(self, change: Change) -> None:
+        """Do nothing: the room is used by the next program."""
 
-    def adopt(self, counters: Counters) -> None:
-        """Adopt `counters` while a thread may still use the earlier ones, whose indexes stay reserved."""
-        self.counters = counters  # from now on, other threads read them, and nothing changes them
+    def adopt(self, change: Change) -> None:
+        """Adopt its counters. The indexes of earlier ones stay reserved, because threads may still use them."""
+        self.counters = change.program.counters  # from now on, other threads read them
+
+    def finish(self, change: Change) -> None:
+        """Free the indexes of series that only earlier programs had."""
+        if change.program.counters is self.counters:
+            self.counters.settle(self.lists)

@@ -1,8 +1,8 @@
-"""The native threads, and the program that they execute.
+"""The native threads, and the image that they execute.
 
-`build` makes arrays from a compiled program and its open sockets and topics; `adopt` switches each thread to them
-between two messages. Messages received before are handled by the earlier program. State that lasts from one message to
-the next is passed on by key.
+An image is written and loaded first (`Images`), so that its deadmen can send before ROS is open; `Plane` switches each
+thread to it between two messages. Messages received before are handled by the earlier image. State that lasts from one
+message to the next is passed on by key.
 """
 
 from __future__ import annotations
@@ -14,31 +14,26 @@ from dataclasses import dataclass
 from itertools import count
 from time import monotonic, sleep
 
-from router import declared as c
+from router.app.change import Change
 from router.app.counts import ThreadCounts
-from router.carrier.boards import NativeBoards
-from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen, await_receipt
-from router.carrier.deadmen import NativeDeadman, replaced, successors
-from router.carrier.deferrals import Adoption, timer_change
+from router.carrier.client_deadmen import ClientDeadmen, await_receipt
 from router.carrier.events import DeadmanEvents, EventReader, EventThread
-from router.carrier.forwarding import KEPT_GENERATION, Forwarding, counts_and_events
+from router.carrier.forwarding import FIRST_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
+from router.carrier.loading import LoadedImage
 from router.carrier.mirror import ActionRing, MirrorRing
-from router.carrier.outlets import AwaitedPublication, Outlets
-from router.carrier.program import NativeProgram, change_to, native_program
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import superseded, where_refused, why_rejected
-from router.carrier.ros_routes import NativeFromRos, Subscription, native_from_ros
-from router.carrier.sender import NativeSender
-from router.carrier.state import State
+from router.carrier.ros_routes import RosRoutes
 from router.clock import boottime_ns
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import ConfigurationError
-from router.kept.head_start import HeadStart
+from router.image.writer import write_image
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
+from router.startup_image.head_start import HeadStart
 
 _PATIENCE_S = 1.0
 """How long, in seconds, a reload waits for a thread that may be stuck in the middleware."""
@@ -47,38 +42,55 @@ _TURN_S = 0.002
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
-    """The open sockets and topics of a program, and its state. Publications and subscriptions are by topic."""
-
-    listeners: Mapping[str, Listener]
-    senders: Mapping[str, NativeSender]
-    publications: Mapping[str, AwaitedPublication]
-    subscriptions: Mapping[str, Subscription]
-    state: State
-
-
-@dataclass(frozen=True, slots=True)
-class Built:
-    """A program as the threads execute it. `deadmen` are of routes, `client_deadmen` of gateway clients, by name.
-
-    `adopted` are its deferrals, pacers and collectors.
-    """
+class Running:
+    """A program as the threads execute it."""
 
     program: Program
-    state: State
-    native: NativeProgram
-    from_ros: NativeFromRos
-    adopted: Sequence[Adoption]
-    deadmen: Mapping[str, NativeDeadman]
-    client_deadmen: Mapping[str, ClientDeadman]
+    image: LoadedImage
 
-    def timers(self, earlier: Built | None, *, of_topics: bool) -> c.TimerChange:
-        """Return changes to the timers of topics or endpoints. Timers only in `earlier` deliver what they hold."""
-        now, before = (
-            [each for each in adopted if each.is_topic is of_topics]
-            for adopted in (self.adopted, earlier.adopted if earlier else ())
-        )
-        return timer_change(now, before)
+
+class Images:
+    """Writes and loads the images of programs."""
+
+    def __init__(self, forwarding: Forwarding, head_start: HeadStart | None) -> None:
+        self._forwarding = forwarding
+        self._head_start = head_start
+        self._generations = count(FIRST_GENERATION + 1)
+
+    # adoption of another program
+
+    def prepare(self, change: Change) -> None:
+        """Load the image. That of the first program has its deadmen send, unless they did so in a head start.
+
+        This needs only sockets, so it does not wait for ROS, which takes longer to open. Raises MemoryError.
+        """
+        assert change.sockets is not None  # noqa: S101 - prepared
+        image = write_image(change.program, self._forwarding.names)
+        change.image = self._forwarding.load(image, change.sockets.senders, next(self._generations), change.before)
+        change.image.bind_listeners(change.sockets.listeners)
+        if change.is_first:
+            for route, deadman in change.image.deadmen.items():
+                sent = self._head_start.sent.get(route) if self._head_start else deadman.start(boottime_ns())
+                if sent:
+                    logger.info("the deadman has sent its payload at startup", route=route, to=sent)
+
+    def undo(self, change: Change) -> None:
+        """Free the image."""
+        change.image = None
+
+    def adopt(self, change: Change) -> None:
+        """Do nothing: the threads change to the image."""
+
+    def finish(self, change: Change) -> None:
+        """End the deadmen that only the earlier image had, and free what only it used; armed deadmen send."""
+        if change.before is not None and change.image is not None:
+            kept = [*change.image.deadmen.values()]
+            for deadman in change.before.deadmen.values():
+                if deadman not in kept:
+                    deadman.end()
+        change.before = self._head_start = None
+        if change.image is not None:
+            change.image.forget_before()
 
 
 class Plane:
@@ -91,17 +103,16 @@ class Plane:
         reporter: Reporter,
         of_deadmen: Callable[[DeadmanEvents], None],
         first: Program,
-        head_start: HeadStart | None = None,
+        head_start: LoadedImage | None = None,
     ) -> None:
-        self.now: Built | None = None
+        self.now: Running | None = None
         """The running program; None before the first one, also during a head start."""
         self.library = library = forwarding.library
         self.counts = counts
         self._head_start = head_start
         self._forwarding, self._names = forwarding, forwarding.names
-        self._deadmen, self._carrier = forwarding.deadmen, forwarding.carrier
-        self._generations = count(KEPT_GENERATION + 1)
-        self._programs = {KEPT_GENERATION: first} if head_start is not None else {}
+        self._deadmen, self._threads = forwarding.deadmen, forwarding.threads
+        self._programs = {FIRST_GENERATION: first} if head_start is not None else {}
         """Programs that explain events, by generation; the newest one is last."""
         self._is_running = head_start is not None
         self.has_stopped = self._has_stopped_ros = False
@@ -113,7 +124,7 @@ class Plane:
             for is_urgent in (True, False)
         ]
         # Copy the publish thread's counts before the receive thread's, so that `messages_waiting` is never negative.
-        threads = self._deadmen, self._client_deadmen, self._publishing, self._carrier, *self._from_ros
+        threads = self._deadmen, self._client_deadmen, self._publishing, self._threads, *self._from_ros
         for thread in threads:
             counts.add_thread(thread)
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
@@ -122,9 +133,14 @@ class Plane:
         self._events = EventThread(threads, reader, reporter.report, of_deadmen, reporter.returned, self._pulse)
 
     @property
+    def image(self) -> LoadedImage | None:
+        """The image that the threads execute."""
+        return self.now.image if self.now is not None else self._head_start
+
+    @property
     def turns(self) -> int:
         """A number that grows unless the receive thread is stuck, even without traffic."""
-        return self._carrier.turns
+        return self._threads.turns
 
     def stalled(self) -> Iterator[tuple[str, float]]:
         """Return the topics on which native threads are publishing now, each with the seconds since the call began."""
@@ -135,156 +151,114 @@ class Plane:
         self._events.start()
 
     def _pulse(self) -> None:
-        self._carrier.pulse()
+        self._threads.pulse()
         for thread in self._from_ros:
             thread.report_failures()
 
-    # building a program
+    # adoption of another program
 
-    def first_state(self) -> State:
-        """Return the state of the first program, which includes what a head start has opened."""
-        return State(self.library, opened=self._head_start.opened if self._head_start else None)
-
-    def start_deadmen(self, program: Program, senders: Mapping[str, NativeSender], state: State) -> None:
-        """Have deadmen send at the start of the router, unless they did so in a head start.
-
-        This needs only sockets, so it does not wait for ROS, which takes longer to open.
-        """
-        for plan in program.deadmen:
-            deadman = self._deadmen.get_or_open(plan, program.counters, senders, state)
-            sent_to = self._head_start.sent[plan.route] if self._head_start else deadman.start(boottime_ns())
-            if sent_to:
-                what = "the deadman has sent its payload at startup"
-                logger.info(what, route=plan.route, to=sent_to)
-
-    def build(self, program: Program, opened: Opened) -> Built:
-        """Make the arrays of a program. Raises StartError."""
-        counters, state = program.counters, opened.state
-        outlets = Outlets.of(
-            program,
-            self._deadmen,
-            state,
-            listeners=opened.listeners,
-            senders=opened.senders,
-            publications=opened.publications,
-            boards=NativeBoards(program.boards),
-        )
-        generation = next(self._generations)
-        native = native_program(program, generation, outlets)
-        from_ros = native_from_ros(program, generation, outlets, opened.subscriptions)
-        for arrays in (native.arrays, from_ros.arrays):
-            arrays.keep(outlets)
-        adopted = [*outlets.pacers(), *native.states.adopted, *from_ros.states.adopted]
-        clients = {
-            plan.route: self._client_deadmen.get_or_open(plan, counters, opened.publications, state)
-            for plan in program.client_deadmen
-        }
-        if self._head_start is not None and self.now is None:
-            for topic, publication in opened.publications.items():
-                self._head_start.bind_topic(topic, publication.address)
-        self._start_threads(program, from_ros, clients)
-        return Built(program, state, native, from_ros, adopted, outlets.deadmen, clients)
-
-    def _start_threads(self, program: Program, from_ros: NativeFromRos, clients: Mapping[str, ClientDeadman]) -> None:
-        """Start the threads that the program needs. Raises StartError.
+    def prepare(self, change: Change) -> None:
+        """Bind the image to its topics, and start the threads that it needs. Raises StartError.
 
         Deadmen of clients are served from now on: clients may publish before the program runs.
         """
-        if program.publishers:
-            first = self._head_start.topics if self._head_start is not None else None
+        image = change.image
+        assert image is not None  # noqa: S101 - prepared
+        publications = change.ros.publications if change.ros else {}
+        subscriptions = change.ros.subscriptions if change.ros else {}
+        for each in (image, change.before):
+            if each is not None and (each is image or change.is_first):  # of a head start, messages may be waiting
+                each.bind_topics(publications)
+        image.open_client_deadmen(self._client_deadmen.group)
+        change.routes = RosRoutes.of(image, {topic: each.raw for topic, each in subscriptions.items()})
+        if change.is_first and self._head_start is not None and self._head_start.image != image.image:
+            self._programs = {}  # they would not explain its events
+        if change.program.publishers:
+            first = self._head_start.topic_change() if change.is_first and self._head_start is not None else None
             self._publishing.start(_functions_of_rcl(self.library), first)
         for thread in self._from_ros:
-            if from_ros.only(urgent=thread.is_urgent).topics:
+            if change.routes.only(urgent=thread.is_urgent).topics:
                 from router.ros.receiving import RESET, TAKE  # rclpy is loaded: the topics are open
 
                 thread.start(TAKE, RESET)
-        if clients:
+        if image.client_deadmen:
             self._client_deadmen.start(_functions_of_rcl(self.library))
-        if self.now is None:
-            for deadman in clients.values():
+        if change.is_first:
+            for deadman in image.client_deadmen.values():
                 deadman.await_subscribers(boottime_ns())
 
-    def subscriber_joined(self, topic: str) -> None:
-        """Shortly after the start, have deadmen of the topic publish to a newly discovered subscriber."""
-        if (now := self.now) is None:
-            return
-        for plan in now.program.client_deadmen:
-            if topic in dict(plan.datagrams) and now.client_deadmen[plan.route].greet(boottime_ns()):
-                what = "the deadman publishes its payload to a new subscriber after startup"
-                logger.info(what, route=plan.route, topic=topic)
+    def undo(self, change: Change) -> None:
+        """Do nothing: threads that were started serve the next program."""
 
-    # running a program
+    def adopt(self, change: Change) -> None:
+        """Switch to the image; the first one starts the threads. Listeners that it lacks are drained.
 
-    def adopt(self, built: Built, unused: Sequence[Listener] = ()) -> None:
-        """Switch to a program; the first one starts the threads. `unused` listeners are drained and closed to input.
-
-        Raises StuckError or StartError with nothing changed. Threads may use the earlier program until
+        Raises StuckError or StartError with nothing changed. Threads may use the earlier image until
         `wait_until_adopted` returns True.
         """
-        earlier, generation = self.now, built.native.generation
+        image, routes, before, sockets = change.image, change.routes, change.before, change.sockets
+        assert image is not None  # noqa: S101 - prepared
+        assert routes is not None  # noqa: S101 - prepared
+        assert sockets is not None  # noqa: S101 - prepared
         with ExitStack() as undo:
             for thread in self._from_ros:
-                thread.hand_over(built.from_ros)
+                thread.hand_over(routes)
                 undo.callback(thread.take_back)
-            # Before the publish thread receives a message of this program.
-            topics = c.PublishChange(timers=built.timers(earlier, of_topics=True), generation=generation)
-            built.native.arrays.keep(topics)
-            self._publishing.change(topics)
+            # Before the publish thread receives a message of this image.
+            self._publishing.change(image.topic_change(before))
             if not self._is_running:
-                self._carrier.start(change_to(built.native, built.timers(None, of_topics=False)), built.native)
+                self._threads.start(image.change(), image)
                 self._is_running = True
             undo.pop_all()
-        if earlier is None:
-            if self._head_start is not None:  # it has the same state: no timer ends, and no deadman is replaced
-                self._carrier.change(change_to(built.native, built.timers(None, of_topics=False)), built.native)
-        else:
-            for listener in unused:
+        if before is not None:
+            for listener in sockets.left:
                 listener.end_input()
-            routes = successors(built.program.deadmen, earlier.program.deadmen)
-            deadmen = replaced(built.deadmen, earlier.deadmen, routes)
-            change = change_to(built.native, built.timers(earlier, of_topics=False), deadmen)
-            self._carrier.change(change, built.native)
-        self._publishing.advance(generation)
+            self._threads.change(image.change(before), image)
+        self._publishing.advance(image.generation)
         # Before the threads that may carry the last messages of deadmen to boards.
-        self._client_deadmen.adopt(earlier.client_deadmen if earlier else {}, built.client_deadmen, generation)
+        earlier = before.client_deadmen if before is not None else {}
+        self._client_deadmen.adopt(earlier, image.client_deadmen, image.generation)
         # After deadmen were replaced: feeding an earlier one now feeds its replacement.
         for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
             thread.follow(other)
-            thread.adopt(built.from_ros)
-        self.now = built
-        self._programs = {**(self._programs if earlier is None else {}), generation: built.program}
+            thread.adopt(routes)
+        self.now = Running(change.program, image)
+        self._programs = {**(self._programs if change.is_first else {}), image.generation: change.program}
+
+    def finish(self, change: Change) -> None:
+        """Do nothing: no thread uses the earlier image any more (`wait_until_adopted`)."""
+        self._head_start = None
 
     def wait_until_adopted(self) -> bool:
-        """Wait until nothing of an earlier program is in use. Return False if that takes longer than a second."""
+        """Wait until nothing of an earlier image is in use. Return False if that takes longer than a second."""
         if not self._is_running or self.now is None:
             return True
-        generation = self.now.native.generation
+        generation = self.now.image.generation
         waits = {"publish": self._publishing.wait_for, "client deadmen": self._client_deadmen.wait_for}
         until = monotonic() + _PATIENCE_S
         late = [name for name, wait_for in waits.items() if not wait_for(generation, max(until - monotonic(), _TURN_S))]
         if late:
             logger.error("thread did not leave the old program in time; its sockets and topics stay open", threads=late)
             return False
-        if not self._wait_for_turn() or not all(thread.has_adopted for thread in self._from_ros):
-            return False
-        self._head_start = None
-        return True
+        return self._wait_for_turn() and all(thread.has_adopted for thread in self._from_ros)
 
     def _wait_for_turn(self) -> bool:
         """Wait until the receive thread has finished its present turn, in which it may drop an earlier message."""
-        turns = self._carrier.turns
+        turns = self._threads.turns
         for _ in range(int(_PATIENCE_S / _TURN_S)):
-            if self._carrier.turns != turns:
+            if self._threads.turns != turns:
                 return True
             sleep(_TURN_S)
         return False
 
-    def end(self, earlier: Built) -> None:
-        """End the deadmen that only an earlier program had, once no thread feeds them; armed ones send."""
-        kept = self.now.deadmen.values() if self.now else ()
-        for deadman in earlier.deadmen.values():
-            if deadman not in kept:
-                deadman.end()
+    def subscriber_joined(self, topic: str) -> None:
+        """Shortly after the start, have deadmen of the topic publish to a newly discovered subscriber."""
+        if (now := self.now) is None:
+            return
+        for plan in now.program.client_deadmen:
+            if topic in dict(plan.datagrams) and now.image.client_deadmen[plan.route].greet(boottime_ns()):
+                what = "the deadman publishes its payload to a new subscriber after startup"
+                logger.info(what, route=plan.route, topic=topic)
 
     # received datagrams and actions, for the mirror
 
@@ -308,19 +282,19 @@ class Plane:
 
     def feed_watchdog(self, notify: int, interval: int) -> None:
         """Feed a watchdog through the connected socket `notify` every `interval` ns; -1 ends that."""
-        self._carrier.watchdog(notify, interval)
+        self._threads.watchdog(notify, interval)
 
     # stopping
 
-    def stop(self, listeners: Sequence[Listener]) -> bool:
+    def stop(self, listeners: Mapping[str, Listener]) -> bool:
         """End all listeners, and handle what has arrived there; messages from ROS are still routed.
 
         Datagrams in an inherited socket stay there for the next process. Return False if a thread is stuck in the
         middleware: then publishers must stay open.
         """
-        for listener in listeners:
+        for listener in listeners.values():
             listener.end_input()
-        self._carrier.stop_receiving()
+        self._threads.stop_receiving()
         self._is_running = False
         has_ended = _stop([self._publishing])
         self.has_stopped = True
@@ -333,7 +307,7 @@ class Plane:
         """
         has_ended = _stop([self._client_deadmen])
         if has_ended and self.now is not None:
-            await_receipt(self.now.client_deadmen.values())
+            await_receipt(self.now.image.client_deadmen.values())
         return has_ended
 
     def stop_ros(self) -> bool:
@@ -350,7 +324,7 @@ class Plane:
         self._deadmen.end()
         if self.has_stopped and self._has_stopped_ros:  # else their threads use what would be freed
             self._events.close()
-            self._carrier.close()
+            self._threads.close()
 
     # explaining events
 

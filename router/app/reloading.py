@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from router import inputs
-from router.app.keeping import Keeper
+from router.app.image_saver import ImageSaver
 from router.app.memory import drop_idle_code
 from router.app.process import reloading
 from router.app.runtime import Runtime
@@ -15,7 +15,6 @@ from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked, uncollected
 from router.compiler.lookup import Definitions
-from router.compiler.metrics import Counters
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
 from router.log import fault, logger
@@ -31,7 +30,7 @@ _MOST_NAMED = 12
 class Reloader:
     """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `replaced` is called once another program runs and the earlier one is closed. `keeper` saves the new program.
+    `replaced` is called once another program runs and the earlier one is closed. `saver` saves its image.
     """
 
     def __init__(
@@ -39,13 +38,13 @@ class Reloader:
         runtime: Runtime,
         environ: Mapping[str, str] | None,
         replaced: Callable[[], None],
-        keeper: Keeper | None = None,
+        saver: ImageSaver | None = None,
     ) -> None:
         self._runtime = runtime
-        self._counts = runtime.plane.counts
+        self._counts = runtime.counts
         self._environ = environ
         self._replaced = replaced
-        self._keeper = keeper
+        self._saver = saver
         self._is_open = False
         self._one_at_a_time = threading.Lock()
         self._remember(is_good=True)  # the first table, before anybody can scrape
@@ -86,7 +85,7 @@ class Reloader:
             if not self._is_open or program is None or not replaceable:
                 return
             try:
-                self._runtime.take_over(self._runtime.prepare(program))
+                self._runtime.take_over(program)
             except (StartError, StuckError, OSError) as error:  # the watcher tries again
                 logger.warning("a listener cannot be reopened", why=str(error))
             else:
@@ -97,7 +96,7 @@ class Reloader:
         """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
         try:
-            with inputs.recording(self._keeper.selection if self._keeper else None) as read:
+            with inputs.recording(self._saver.selection if self._saver else None) as read:
                 checked = self._check(now)
             findings = checked.diagnostics
             then = checked.program_in(now.counters.continued())
@@ -108,7 +107,7 @@ class Reloader:
             text = _changes(now, then)
             if not self._is_open:
                 raise StartError("the router is stopping")
-            self._runtime.take_over(self._runtime.prepare(then))
+            self._runtime.take_over(then)
             if moved := _all_moved(now.table, then.table):
                 logger.warning("the reload has changed the address of every endpoint", endpoints=moved)
         except (StartError, StuckError) as error:
@@ -121,8 +120,8 @@ class Reloader:
             why = f"{found.event}: {error!r}"
         else:
             self._notify_replaced()
-            if self._keeper is not None:
-                self._keeper.keep(lambda: checked.program_in(Counters()), read)
+            if self._saver is not None and (image := self._runtime.plane.image) is not None:
+                self._saver.save(image.image, read)
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
 

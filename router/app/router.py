@@ -10,11 +10,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from router import __version__
+from router.app.change import Change
 from router.app.counts import ThreadCounts
-from router.app.keeping import Keeper
+from router.app.image_saver import ImageSaver
 from router.app.plane import Plane
 from router.app.reloading import Reloader
-from router.app.runtime import Change, Runtime
+from router.app.runtime import Runtime
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
 from router.carrier.events import DeadmanChange, DeadmanEvents
 from router.carrier.forwarding import Forwarding
@@ -22,7 +23,6 @@ from router.clock import boottime_ns
 from router.compiler.metrics import Answer, Evidence, Mismatch
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
-from router.kept.head_start import HeadStart
 from router.library import library
 from router.log import logger
 from router.net.doors import Door
@@ -31,6 +31,7 @@ from router.observe.obedience import Obedience, Replies
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
+from router.startup_image.head_start import HeadStart
 from router.table.addresses import Address
 from router.table.model import HOW_TO_KEEP
 from router.threads import DaemonThread, StopStack, background_threads
@@ -57,8 +58,8 @@ class Router:
 
     Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, for example `["--ros-args",
     "-r", "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
-    The router adopts `head_start`, which runs the same program; `keeper` saves the program for the next start. `start`
-    is one of STARTS.
+    The router replaces the image of `head_start`; `saver` saves the program's for the next start. `is_refused`: a
+    stored image was not used.
     """
 
     def __init__(
@@ -67,24 +68,25 @@ class Router:
         ros_args: Sequence[str] = (),
         environ: Mapping[str, str] | None = None,
         head_start: HeadStart | None = None,
-        keeper: Keeper | None = None,
-        start: str = "compiled",
+        saver: ImageSaver | None = None,
+        *,
+        is_refused: bool = False,
     ) -> None:
         self.is_ready = False
         self._first = program
-        self._start = start
+        self._start = "refused" if is_refused else "compiled"
+        self._head_start = head_start
         self._reporter = Reporter(self._address_of)
         self._obedience = Obedience()
         self._counts = ThreadCounts(program.counters)
         forwarding = head_start.forwarding if head_start else Forwarding(library(), program.counters.size)
-        plane = Plane(forwarding, self._counts, self._reporter, self._of_deadman, program, head_start)
+        image = head_start.image if head_start else None
+        plane = Plane(forwarding, self._counts, self._reporter, self._of_deadman, program, image)
         self.mirror = Mirror(plane, self._reporter.failed)
-        self._runtime = Runtime(plane, self._reporter, ros_args)
-        if head_start is not None:
-            self._runtime.sockets.take_over(program, head_start.listening, head_start.senders)
-        self._services = Services(self, self._runtime.refused)
-        self._keeper = keeper
-        self._reloader = Reloader(self._runtime, environ, self._replaced, keeper)
+        self._runtime = Runtime(plane, forwarding, self._reporter, ros_args, head_start)
+        self._services = Services(self, self._runtime.gateways.refused)
+        self._saver = saver
+        self._reloader = Reloader(self._runtime, environ, self._replaced, saver)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._known: Mapping[str, int] = dict.fromkeys(program.table.endpoints, boottime_ns())
@@ -100,10 +102,8 @@ class Router:
             self._runtime.plane.start_reporting()
             if self._first.table.record is not None:  # for the recorder, which opens later, but records from here on
                 self._runtime.plane.observe(is_observed=True)
-            with background_threads():
-                change = self._runtime.prepare(self._first)
-                opening.callback(change.undo.close)
-            self._runtime.start(change)
+            change = self._runtime.start(self._first)
+            self._compare_with_head_start(change)
             with background_threads():
                 self._open_services(change, services)
             self._reloader.open()
@@ -122,9 +122,17 @@ class Router:
             published=len(program.publishers),
             subscribed=len(program.subscriptions),
         )
-        if self._keeper is not None:
-            self._keeper.keep(lambda: self._first, self._keeper.read)
+        if self._saver is not None and change.image is not None:
+            self._saver.save(change.image.image, self._saver.read)
         return self
+
+    def _compare_with_head_start(self, change: Change) -> None:
+        head_start, self._head_start = self._head_start, None
+        if head_start is not None and change.image is not None:
+            is_same = head_start.image.image == change.image.image
+            self._start = "kept" if is_same else "replaced"
+            if not is_same:
+                logger.warning("an input has changed since the start: the compiled table replaces the startup image")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -190,7 +198,7 @@ class Router:
 
     def _open_services(self, change: Change, opening: ExitStack) -> None:
         diagnostics = change.ros.publications.get(DIAGNOSTICS) if change.ros else None
-        self._services.open(opening, (self._runtime.node_name, diagnostics.publish) if diagnostics else None)
+        self._services.open(opening, (self._runtime.topics.node_name, diagnostics.publish) if diagnostics else None)
         opening.callback(self.mirror.close)
 
     def _of_deadman(self, event: DeadmanEvents) -> None:
@@ -242,18 +250,20 @@ class Router:
         """Return the series without a counter, whose values are computed at each scrape."""
 
         def of_clients(value: Callable[[ClientQueue], float]) -> SeriesFunction:
-            return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
+            return lambda: gateways.clients(value) if (gateways := self._runtime.gateways.thread) else ()
 
         return {
             **self._services.computed_series(),
-            "connections_refused": lambda: [((server,), n) for server, n in list(self._runtime.refused.items())],
+            "connections_refused": lambda: [
+                ((server,), n) for server, n in list(self._runtime.gateways.refused.items())
+            ],
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
-            "topic_subscribers": self._runtime.subscribers,
-            "type_incompatible": self._runtime.type_incompatible,
-            "other_routers": self._runtime.other_routers,
-            "node_namesakes": self._runtime.node_namesakes,
+            "topic_subscribers": self._runtime.topics.subscribers,
+            "type_incompatible": self._runtime.topics.type_incompatible,
+            "other_routers": self._runtime.topics.other_routers,
+            "node_namesakes": self._runtime.topics.node_namesakes,
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(boottime_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),
             "gateway_client_dropped": of_clients(lambda client: client.dropped),

@@ -8,15 +8,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
+from router.app.change import Change
 from router.carrier.sender import NativeSender
 from router.compiler.network import LOOPBACK, WILDCARD, sent_from
-from router.compiler.program import Program
 from router.errors import ConfigurationError
 from router.log import logger
 from router.net.sockets import ListeningSocket, placed
 from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
+from router.startup_image.head_start import HeadStart
 from router.table import model
-from router.table.addresses import Address, BadAddressError
+from router.table.addresses import BadAddressError
 
 
 @dataclass(slots=True)
@@ -24,13 +25,13 @@ class SocketChange:
     """All sockets of the next program: listeners by name, senders by endpoint.
 
     `moves` are new sockets for senders that stay, each with the listener whose port it uses. `opened` closes the
-    sockets opened for the change. Once the change is applied, `unused` closes the sockets that it does not use.
+    sockets opened for the change, and `unused` those that it does not use. `left` are the listeners among these.
     """
 
-    program: Program
     listeners: dict[str, Listener]
     senders: dict[str, NativeSender]
     moves: list[tuple[NativeSender, ListeningSocket | None, socket.socket]]
+    left: list[Listener | ListeningSocket]
     opened: ExitStack
     unused: ExitStack = field(default_factory=ExitStack)
 
@@ -71,12 +72,9 @@ def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
     )
 
 
-_Destination = tuple[Address, model.EndpointKind]
-
-
-def _destination(endpoint: model.Endpoint) -> _Destination:
+def _destination(endpoint: model.Endpoint) -> object:
     """Return the settings of an endpoint that its sender depends on."""
-    return endpoint.address.value, endpoint.kind
+    return tuple(endpoint.address.value), endpoint.kind is model.EndpointKind.BOARD
 
 
 class KernelDrops:
@@ -105,41 +103,26 @@ class KernelDrops:
 
 
 class Sockets:
-    """Open listeners by name, and senders by endpoint; none before the first change is applied.
+    """Open listeners by name, and senders by endpoint. At first, these are the sockets of a head start if there is one.
 
     `library` is that of the carrier, which sends.
     """
 
-    def __init__(self, drops: KernelDrops, library: ctypes.CDLL) -> None:
+    def __init__(self, drops: KernelDrops, library: ctypes.CDLL, head_start: HeadStart | None = None) -> None:
         self._library = library
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
-        self._senders: dict[str, tuple[_Destination, NativeSender]] = {}
+        self._inherited: list[ListeningSocket] = [*head_start.listening.values()] if head_start else []
+        self._senders: dict[str, tuple[object, NativeSender]] = {**head_start.senders} if head_start else {}
         self._drops = drops
 
-    def take_over(
-        self, program: Program, listening: Mapping[str, ListeningSocket], senders: Mapping[str, NativeSender]
-    ) -> None:
-        """Adopt the sockets that a head start has opened for a program."""
-        plans = {plan.name: plan for plan in program.listeners}
-        self.listeners = {name: Listener(plans[name], opened=opened) for name, opened in listening.items()}
-        self._bound = {plans[name].bound_to: listener for name, listener in self.listeners.items()}
-        self._senders = {to.name: (_destination(to), senders[to.name]) for to in program.senders}
-        for name, listener in self.listeners.items():
-            self._drops.follow(name, listener.kernel_drops)
+    # adoption of another program
 
-    def prepare(self, program: Program) -> SocketChange:
-        """Open the sockets of `program` that are not open yet. Raises StartError or OSError with nothing changed."""
+    def prepare(self, change: Change) -> None:
+        """Open the sockets that are not open yet. Raises StartError or OSError."""
+        program = change.program
         with ExitStack() as opening:
-            listeners = {}
-            for plan in program.listeners:
-                listener = self._bound.get(plan.bound_to)
-                if listener is None or listener.is_replaceable():
-                    listener = Listener(plan, has_senders=plan.address.value.port in self._sending_ports())
-                    opening.callback(listener.close)
-                if listener.lacks_network():
-                    _log_absence(plan)
-                listeners[plan.name] = listener
+            listeners = {plan.name: self._listener(plan, opening) for plan in program.listeners}
             senders: dict[str, NativeSender] = {}
             moves = []
             every = [each.opened for each in (*self._bound.values(), *listeners.values())]
@@ -160,48 +143,74 @@ class Sockets:
                     moves.append((sender, beside, opened))
                 _check_source(to, sender)
                 senders[to.name] = sender
-            return SocketChange(program, listeners, senders, moves, opening.pop_all())
+            used = [each.opened for each in listeners.values()]
+            left: list[Listener | ListeningSocket] = [each for each in self._bound.values() if each.opened not in used]
+            left += [each for each in self._inherited if each not in used]
+            change.sockets = SocketChange(listeners, senders, moves, left, opening.pop_all())
+
+    def _listener(self, plan: model.Listener, opening: ExitStack) -> Listener:
+        """Return the open listener of a plan, or open it."""
+        listener = self._bound.get(plan.bound_to)
+        if listener is None or listener.is_replaceable():
+            wanted = tuple(plan.address.value), plan.interface
+            opened = next((each for each in self._inherited if each.wanted == wanted), None)
+            listener = Listener(plan, opened=opened, has_senders=plan.address.value.port in self._sending_ports())
+            if opened is None:
+                opening.callback(listener.close)
+        if listener.lacks_network():
+            _log_absence(plan)
+        return listener
 
     def _sending_ports(self) -> set[int]:
         """Return the ports that a listener and a sender share."""
         senders = [sender for _, sender in self._senders.values()]
         return {sender.source.address[1] for sender in senders if sender.source is not None and sender.is_bound}
 
-    def unused_listeners(self, change: SocketChange) -> list[Listener]:
-        """Return the listeners that the change does not use."""
-        return [each for each in self._bound.values() if each not in change.listeners.values()]
+    def undo(self, change: Change) -> None:
+        """Close the sockets that `prepare` has opened."""
+        if change.sockets is not None:
+            change.sockets.opened.close()
 
-    def apply(self, change: SocketChange) -> None:
-        """Replace the sockets with those of the change."""
-        for listener in self.unused_listeners(change):
-            change.unused.callback(listener.close)
+    def adopt(self, change: Change) -> None:
+        """Send and receive through the sockets of the change."""
+        sockets, plans = change.sockets, {plan.name: plan for plan in change.program.listeners}
+        assert sockets is not None  # noqa: S101 - prepared
+        sockets.opened.pop_all()
+        for listener in sockets.left:
+            sockets.unused.callback(listener.close)
         for endpoint, (_, sender) in self._senders.items():
-            if change.senders.get(endpoint) is not sender:
-                change.unused.callback(sender.close)
-        for sender, source, opened in change.moves:
-            change.unused.callback(sender.move(source, opened).close)
-        self._follow_drops(change)
-        plans = {plan.name: plan for plan in change.program.listeners}
-        for name, listener in change.listeners.items():
-            listener.follow(plans[name])
-        self.listeners = change.listeners
-        self._bound = {plans[name].bound_to: listener for name, listener in change.listeners.items()}
-        self._senders = {to.name: (_destination(to), change.senders[to.name]) for to in change.program.senders}
+            if sockets.senders.get(endpoint) is not sender:
+                sockets.unused.callback(sender.close)
+        for sender, source, opened in sockets.moves:
+            sockets.unused.callback(sender.move(source, opened).close)
+        self._follow_drops(sockets.listeners)
+        for name, each in sockets.listeners.items():
+            each.follow(plans[name])
+        self.listeners, self._inherited = sockets.listeners, []
+        self._bound = {plans[name].bound_to: each for name, each in sockets.listeners.items()}
+        self._senders = {to.name: (_destination(to), sockets.senders[to.name]) for to in change.program.senders}
+
+    def finish(self, change: Change) -> None:
+        """Close the sockets that only the earlier program used."""
+        if change.sockets is not None:
+            change.sockets.unused.close()
 
     def close_listeners(self) -> None:
         for listener in self.listeners.values():
             listener.close()
+        for opened in self._inherited:
+            opened.close()
 
     def close_senders(self) -> None:
         for _, sender in self._senders.values():
             sender.close()
 
-    def _follow_drops(self, change: SocketChange) -> None:
-        moved = {name for name, each in self.listeners.items() if change.listeners.get(name) is not each}
+    def _follow_drops(self, listeners: Mapping[str, Listener]) -> None:
+        moved = {name for name, each in self.listeners.items() if listeners.get(name) is not each}
         for name in moved:
             self._drops.unfollow(name)
         known = self._bound.values()
-        for name, listener in change.listeners.items():
+        for name, listener in listeners.items():
             if self.listeners.get(name) is not listener:
                 since = listener.kernel_drops() if listener in known else 0
                 self._drops.follow(name, listener.kernel_drops, since=since)

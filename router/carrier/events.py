@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from socket import inet_ntoa
 from typing import Union, cast
 
-from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
@@ -26,6 +25,7 @@ from router.declared import (
     Reason,
     ReturnedEvent,
 )
+from router.image.names import Names
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000

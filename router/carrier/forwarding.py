@@ -5,28 +5,32 @@ from __future__ import annotations
 import ctypes
 from mmap import MAP_PRIVATE, mmap
 
-from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
-from router.carrier.names import Names
+from router.carrier.forwarding_threads import ForwardingThreads
+from router.carrier.loading import LoadedImage
+from router.carrier.owned import open_native
 from router.carrier.ring import Ring
-from router.carrier.state import open_native
+from router.image.names import Names
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+
+    from router.carrier.loading import Addressed
+    from router.image.image import Image
 
 MOST_COUNTERS = 1 << 18
 """Counters of each native thread: a fixed number, because their addresses must not change."""
 
-KEPT_GENERATION = 1
-"""The generation of a kept program; compiled programs have higher ones."""
+FIRST_GENERATION = 1
+"""The generation of a stored image; compiled ones have higher generations."""
 
 _PUBLISHED, _MIRRORED, _ACTIONS, _EVENTS = 1 << 20, 1 << 22, 1 << 18, 1 << 18
 """Bytes of the queues: messages for topics, received datagrams and actions for observers, and events of a thread."""
 
 
 class Forwarding:
-    """The threads `receive` and `timers`, which run once `carrier` is started.
+    """The threads `receive` and `timers`, which run once they are started.
 
     `published` gets the messages for topics; while there are observers, `mirrored` gets the received datagrams, and
     `acted` the actions. `names` are the names known already, `counters` is the number of counters of the first program.
@@ -39,8 +43,16 @@ class Forwarding:
         self.published, self.mirrored = Ring(library, _PUBLISHED), Ring(library, _MIRRORED)
         self.acted = Ring(library, _ACTIONS)
         self._actions = open_native(library, "actions_open", self.acted.address)
-        self.deadmen = Deadmen(library, *counts_and_events(library, counters), self.names)
-        self.carrier = Carrier(library, self.deadmen.address, *counts_and_events(library, counters), self.published)
+        self.deadmen = Deadmen(library, *counts_and_events(library, counters))
+        self.threads = ForwardingThreads(
+            library, self.deadmen.address, *counts_and_events(library, counters), self.published
+        )
+
+    def load(
+        self, image: Image, senders: Mapping[str, Addressed], generation: int, before: LoadedImage | None = None
+    ) -> LoadedImage:
+        """Load an image for these threads. Raises MemoryError."""
+        return LoadedImage(self.library, image, senders, self.deadmen.address, generation, before)
 
     def mirror(self, lost: int | None, *others: int) -> None:
         """Mirror received datagrams and actions from now on; `lost` counts those that full rings drop. None stops that.
@@ -50,7 +62,7 @@ class Forwarding:
         self.library.actions_count_lost(self._actions, lost or 0)
         for group in (self.deadmen.address, *others):
             self.library.timers_observe(group, None if lost is None else self._actions)
-        self.carrier.mirror(None if lost is None else self.mirrored, lost or 0)
+        self.threads.mirror(None if lost is None else self.mirrored, lost or 0)
 
 
 def counts_and_events(library: ctypes.CDLL, counters: int) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:

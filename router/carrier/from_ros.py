@@ -11,7 +11,7 @@ from time import sleep
 
 from router import declared as c
 from router.carrier.ring import Ring
-from router.carrier.ros_routes import NativeFromRos, Subscription
+from router.carrier.ros_routes import RosRoutes, Subscription
 from router.carrier.threads import NativeThread
 from router.errors import StartError
 from router.log import logger
@@ -25,7 +25,7 @@ _IN_TRANSIT_S = 0.01
 class _TopicSet:
     """The topics that the thread serves, and the eventfd of each subscription. `structure` points into `topics`."""
 
-    messages: NativeFromRos
+    messages: RosRoutes
     eventfds: Mapping[Subscription, int]
     topics: ctypes.Array[c.RosTopic]
     structure: c.RosSet
@@ -57,8 +57,8 @@ class FromRosThread(NativeThread):
         self.has_adopted = True
         """Whether the thread serves the topics that it was last given."""
         self._deadmen = deadmen
-        self._adopted = NativeFromRos()
-        self._served = _topic_set(NativeFromRos(), {})
+        self._adopted = RosRoutes()
+        self._served = _topic_set(RosRoutes(), {})
         self._reported = 0
 
     def start(self, take: int, reset: int) -> None:
@@ -88,7 +88,7 @@ class FromRosThread(NativeThread):
             )
         self._reported = failures
 
-    def hand_over(self, messages: NativeFromRos) -> None:
+    def hand_over(self, messages: RosRoutes) -> None:
         """Stop serving the topics that `messages` assign to the other thread, after handling what has arrived on them.
 
         Raises StuckError with nothing changed, even if there is no such topic.
@@ -103,7 +103,7 @@ class FromRosThread(NativeThread):
         """Undo `hand_over`."""
         self.adopt(self._adopted)
 
-    def adopt(self, messages: NativeFromRos) -> None:
+    def adopt(self, messages: RosRoutes) -> None:
         """Serve this thread's messages of another program. If that fails, keep serving the earlier ones."""
         messages = messages.only(urgent=self.is_urgent)
         try:
@@ -115,7 +115,7 @@ class FromRosThread(NativeThread):
             self._adopted = messages
             self.has_adopted = True
 
-    def serve(self, messages: NativeFromRos) -> None:
+    def serve(self, messages: RosRoutes) -> None:
         """Switch to the topics of `messages` between two messages.
 
         Messages that have arrived on other subscriptions are handled first; these may be closed afterwards. Raises
@@ -185,7 +185,7 @@ _stuck: list[FromRosThread] = []
 """Stuck threads: what they use must live until the process ends."""
 
 
-def _topic_set(messages: NativeFromRos, eventfds: Mapping[Subscription, int]) -> _TopicSet:
+def _topic_set(messages: RosRoutes, eventfds: Mapping[Subscription, int]) -> _TopicSet:
     subscriptions = messages.subscriptions
     topics = [
         c.RosTopic(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-from math import ceil
 from typing import NamedTuple
 
 from router import declared as c
-from router.carrier.state import open_native
+from router.carrier.owned import open_native
+from router.image.openings import period
 
 _UNKNOWN = -(1 << 63)
-_NS = 1_000_000_000
 
 
 class TimeRange(NamedTuple):
@@ -52,8 +51,3 @@ class RateLimit:
 
     def __del__(self) -> None:
         self._close(self._at)
-
-
-def period(hertz: float) -> int:
-    """Return the time between two messages at `max_rate`, in ns."""
-    return ceil(_NS / hertz)

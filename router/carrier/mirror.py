@@ -8,12 +8,12 @@ import sys
 from functools import cache
 from socket import inet_ntoa
 
-from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.ring import Ring
 from router.compiler.refusals import why_refused
 from router.datagrams import Peer
 from router.declared import NO_NAME, ROUTED, Action, ActionRecord, MirrorRecord
+from router.image.names import Names
 
 _HEAD, _ACTION_HEAD = ctypes.sizeof(MirrorRecord), ctypes.sizeof(ActionRecord)
 

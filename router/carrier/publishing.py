@@ -6,11 +6,11 @@ import ctypes
 from time import sleep
 
 from router import declared as c
-from router.carrier.names import Names
 from router.carrier.ring import Ring
 from router.carrier.threads import NativeThread
 from router.clock import monotonic_ns
 from router.errors import StartError
+from router.image.names import Names
 
 _POLL_S = 0.002
 

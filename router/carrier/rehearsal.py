@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import ctypes
 import socket
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from types import SimpleNamespace
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple, Union
 from weakref import finalize
 
 from router import declared as c
-from router.carrier.boards import NativeBoards
-from router.carrier.deadmen import DeadmanGroup, NativeDeadman, replaced, successors
-from router.carrier.deferrals import Adoption, timer_change
 from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned
-from router.carrier.names import Names
-from router.carrier.outlets import Outlets
-from router.carrier.program import NativeProgram, change_to, native_program
+from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
-from router.carrier.ros_routes import NativeFromRos, native_from_ros
-from router.carrier.state import State
 from router.compiler.program import Program
 from router.declared import RecordKind
-from router.table.model import Endpoint
+from router.image.image import Image
+from router.image.names import Names
+from router.image.writer import write_image
 
 Peer = tuple[str, int]
 
@@ -76,33 +69,35 @@ class Stage:
 
     def adopt(self, program: Program) -> None:
         """Switch to a program, with state passed on by key as at a reload. Raises MemoryError."""
-        earlier, state = self._opened.running, State(self._library, self._opened.state)
+        before = self._opened.running
         self._generation += 1
-        running = self._built(program, state)
-        self._serve(running, earlier)
-        self._opened.state, self._opened.running = state, running
-        state.forget_previous()
+        running = self._loaded(program, write_image(program, self._names), before.image if before else None)
+        self._serve(running, before)
+        running.image.forget_before()
 
     def restart(self, now: int) -> None:
         """Restart the current program, like a router that has just started. Raises MemoryError."""
-        running, state = self._in_use, State(self._library, self._opened.state)
-        fixed = self._fixed(running.program, state, running.fixed.boards)
-        state.forget_previous()
+        program, image = self._in_use.program, self._in_use.image.image
         self._opened.reopen(now)
         self.now = now
-        running.bind(self._bound(running.program, state, fixed))
-        self._serve(running, None)
-        self._opened.state, self._opened.running = state, running
+        self._serve(self._loaded(program, image, None), None)
 
-    def _serve(self, running: _Running, earlier: _Running | None) -> None:
-        before = earlier.deadmen if earlier else {}
-        dropped = [each.address for each in before.values() if each not in running.deadmen.values()]
-        timers = running.timers(earlier, dropped, of_topics=False)
-        routes = successors(running.program.deadmen, earlier.program.deadmen) if earlier else {}
-        change = change_to(running.native, timers, replaced(running.deadmen, before, routes))
-        of_topics = running.timers(earlier, (), of_topics=True)
-        address = self._opened.address
-        self._library.rehearsal_adopt(address, ctypes.byref(change), ctypes.byref(of_topics), running.topics)
+    def _loaded(self, program: Program, image: Image, before: LoadedImage | None) -> _Running:
+        opened = self._opened
+        senders = {name: opened.sender(name, address) for name, address, *_ in image.senders}
+        loaded = LoadedImage(opened.library, image, senders, opened.timers, self._generation, before)
+        loaded.bind_topics(dict.fromkeys((topic for topic, _ in image.topics), _TOPIC))
+        return _Running(program, loaded)
+
+    def _serve(self, running: _Running, before: _Running | None) -> None:
+        image, earlier = running.image, before.image if before else None
+        deadmen = earlier.deadmen.values() if earlier else ()
+        ended = [each.address for each in deadmen if each not in image.deadmen.values()]
+        change, of_topics = image.change(earlier, ended), image.timers(earlier, of_topics=True)
+        self._library.rehearsal_adopt(
+            self._opened.address, ctypes.byref(change), ctypes.byref(of_topics), running.topics
+        )
+        self._opened.running = running
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
         """Receive a datagram. `arrived_at` is wall-clock time. Raises KeyError for an unknown listener."""
@@ -169,47 +164,15 @@ class Stage:
         is_current = generation == self._generation
         return where_refused(self._in_use.program.lowered, route, topic, target, place) if is_current else ""
 
-    # programs
-
-    def _built(self, program: Program, state: State) -> _Running:
-        fixed = self._fixed(program, state, NativeBoards(program.boards))
-        bound = self._bound(program, state, fixed)
-        native = native_program(program, self._generation, bound.outlets)
-        return _Running(program, fixed, bound, native, native_from_ros(program, self._generation, bound.outlets))
-
-    def _fixed(self, program: Program, state: State, boards: NativeBoards) -> _Fixed:
-        publications = {
-            plan.label: state.get_or_make(("topic", plan.topic, plan.type_name, plan.qos), _Publication)
-            for plan in program.publishers
-        }
-        return _Fixed({each.name: self._sender(each, state) for each in program.senders}, publications, boards)
-
-    def _bound(self, program: Program, state: State, fixed: _Fixed) -> _Bound:
-        """Open mutable objects, unless `state` has them."""
-        group = DeadmanGroup(self._library, self._opened.timers, self._names)
-        outlets = Outlets.of(
-            program,
-            group,
-            state,
-            listeners={plan.name: _Listener() for plan in program.listeners},  # type: ignore[misc]
-            senders=fixed.senders,
-            publications=fixed.publications,
-            boards=fixed.boards,
-        )
-        return _Bound(outlets, outlets.pacers())
-
-    def _sender(self, endpoint: Endpoint, state: State) -> _Sender:
-        return state.get_or_make(("sender", endpoint.name, endpoint.address.value), partial(_Sender, self._library))
-
 
 class _Opened:
-    """The C stage, and the program that it executes."""
+    """The C stage, its senders, and the program that it executes."""
 
     def __init__(self, library: ctypes.CDLL, now: int) -> None:
         self.library = library
         self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
         self.running: _Running | None = None
-        self.state = State(library)
+        self._senders: dict[tuple[str, Peer], _Sender] = {}
         self._open(now)
 
     def _open(self, now: int) -> None:
@@ -217,6 +180,12 @@ class _Opened:
         if not self.address:
             raise MemoryError("the stage cannot be opened")
         self.timers: int = self.library.rehearsal_timers(self.address)
+
+    def sender(self, endpoint: str, address: Peer) -> _Sender:
+        """Return the sender of an endpoint; one that gets another address gets another sender."""
+        if (endpoint, address) not in self._senders:
+            self._senders[endpoint, address] = _Sender(self.library)
+        return self._senders[endpoint, address]
 
     def reopen(self, now: int) -> None:
         self.close()
@@ -229,8 +198,8 @@ class _Opened:
             return
         self.library.rehearsal_end(self.address)
         if self.running is not None:
-            self.running.release()
-        self.running, self.state = None, State(self.library)
+            self.running.image.close()
+        self.running = None
         self.library.rehearsal_close(self.address)
         self.address = 0
 
@@ -249,78 +218,26 @@ class _Sender:
             self._library.sender_close(self.address)
 
 
-class _Listener:
-    """A listener without a socket. Stands for `net.udp.Listener`."""
-
-    is_inherited = False
-    socket = SimpleNamespace(fileno=lambda: -1)
-
-
-class _Publication:
+class _Topic:
     """A topic with a subscriber. Stands for `ros.endpoints.Publication`."""
 
-    def __init__(self) -> None:
-        self.address = 0
-        self.wanted = (ctypes.c_uint8 * 1)(1)
+    address = 0
+    wanted = (ctypes.c_uint8 * 1)(1)
 
 
-class _Fixed(NamedTuple):
-    """The open objects of a program that messages do not change: `senders` by endpoint, `publications` by topic."""
-
-    senders: Mapping[str, _Sender]
-    publications: Mapping[str, _Publication]
-    boards: NativeBoards
-
-
-class _Bound(NamedTuple):
-    """The open objects of a program that messages change."""
-
-    outlets: Outlets
-    pacers: Sequence[Adoption]
+_TOPIC = _Topic()
 
 
 class _Running:
     """A program as the stage executes it. Listeners and topics are numbered by their index in its arrays."""
 
-    def __init__(
-        self, program: Program, fixed: _Fixed, bound: _Bound, native: NativeProgram, from_ros: NativeFromRos
-    ) -> None:
-        self.program, self.fixed, self.native = program, fixed, native
-        self.listeners = {plan.name: number for number, plan in enumerate(program.listeners)}
-        self.topic_numbers = {topic: number for number, topic in enumerate(from_ros.topics)}
-        routes = from_ros.topics.values()
-        self.topics = (c.RosTopic * len(routes))(*(c.RosTopic(routes=each, route_count=len(each)) for each in routes))
-        self._from_ros = from_ros
-        self._bound: _Bound | None = bound
-
-    @property
-    def deadmen(self) -> Mapping[str, NativeDeadman]:
-        return self._bound.outlets.deadmen if self._bound else {}
-
-    @property
-    def adopted(self) -> Sequence[Adoption]:
-        pacers = self._bound.pacers if self._bound else ()
-        return [*pacers, *self.native.states.adopted, *self._from_ros.states.adopted]
-
-    def bind(self, bound: _Bound) -> None:
-        """Point the arrays to other state."""
-        self._bound = bound
-        for states in (self.native.states, self._from_ros.states):
-            states.bind(bound.outlets)
-
-    def release(self) -> None:
-        """Release the state, before the stage is closed."""
-        self._bound = None
-        for states in (self.native.states, self._from_ros.states):
-            states.release()
-
-    def timers(self, earlier: _Running | None, ended: Sequence[int], *, of_topics: bool) -> c.TimerChange:
-        """Return the changes of timers for topics or for endpoints; timers in `ended` also end."""
-        now, before = (
-            [each for each in adopted if each.is_topic is of_topics]
-            for adopted in (self.adopted, earlier.adopted if earlier else ())
-        )
-        return timer_change(now, before, ended)
+    def __init__(self, program: Program, image: LoadedImage) -> None:
+        self.program, self.image = program, image
+        self.listeners: Mapping[str, int] = {plan.name: number for number, plan in enumerate(program.listeners)}
+        routes = [*image.ros_routes()]
+        self.topic_numbers: Mapping[str, int] = {topic: number for number, (topic, *_) in enumerate(routes)}
+        topics = [c.RosTopic(routes=each, route_count=len(each)) for _, each, _ in routes]
+        self.topics = (c.RosTopic * len(topics))(*topics)
 
 
 def _number(host: str) -> int:

@@ -112,7 +112,7 @@ def _print(*lines: str) -> None:
 
 def _kept(table: Path) -> Iterator[str]:
     """Yield lines about the kept programs that were compiled from this table, or from a table that extends it."""
-    from router.kept import store
+    from router.startup_image import store
 
     try:
         folder = store.folder()

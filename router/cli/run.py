@@ -22,9 +22,9 @@ from router.log import configure_log, logger
 
 if TYPE_CHECKING:
     from router.app import Router
-    from router.app.keeping import Keeper
+    from router.app.image_saver import ImageSaver
     from router.compiler.program import Program
-    from router.kept.head_start import HeadStartAttempt
+    from router.startup_image.head_start import HeadStartAttempt
     from router.table.addresses import Address
     from router.table.model import Gateway
 
@@ -60,15 +60,16 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from router.app.keeping import Keeper
+    from router.app.image_saver import ImageSaver
     from router.compiler.check import uncollected
-    from router.kept.head_start import ATTEMPTS
-    from router.library import library
+    from router.compiler.metrics import Counters
     from router.ros.arguments import ROUTES_PATH, Variables, ros_parameters, table_variables, without_effect
+    from router.startup_image.head_start import ATTEMPTS
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     attempt = ATTEMPTS[0] if ATTEMPTS else None
+    head_start = attempt.head_start if attempt is not None else None
     if attempt is not None:
         _log(attempt)
     with uncollected():  # until the router has started
@@ -76,23 +77,21 @@ def run(args: argparse.Namespace) -> int:
             parameters = ros_parameters(args.ros_args)
             environ = Variables(table_variables(parameters), inputs.ENVIRONMENT)
             table = _table(args, ROUTES_PATH, parameters.get(ROUTES_PATH))
+        counters = Counters.of(head_start.image.image.series, head_start.image.image.counters) if head_start else None
         with inputs.recording(selection) as read:
-            program = good_table(table, environ)[1]  # only the program, so that a reload can free the rest
+            program = good_table(table, environ, counters=counters)[1]  # only this, so that a reload can free the rest
         _warn_of(without_effect(args.ros_args, program, environ.names_read))
-        start = "compiled"
-        keeper = None
+        saver = None
         if attempt is not None:
-            start = _reconcile(attempt, program, read)
-            kept = attempt.head_start.inputs if attempt.head_start is not None else None
-            keeper = Keeper(library(), selection, read, kept)
+            saver = ImageSaver(selection, read, head_start.inputs if head_start is not None else None)
         if not signal.sigpending() & _ENDING:  # held back since the head start began
-            route(program, args.ros_args, environ, attempt, keeper, start)
+            route(program, args.ros_args, environ, attempt, saver)
     return OK
 
 
 def _log(attempt: HeadStartAttempt) -> None:
     """Log the head start, or why a kept program is not used."""
-    from router.kept.store import CHANGED
+    from router.startup_image.store import CHANGED
 
     if attempt.head_start is not None:
         listening = [*attempt.head_start.listening]
@@ -100,20 +99,6 @@ def _log(attempt: HeadStartAttempt) -> None:
     elif attempt.why:
         log = logger.info if attempt.why.endswith(CHANGED) else logger.warning
         log("the kept program is not used: the table is compiled first", why=attempt.why)
-
-
-def _reconcile(attempt: HeadStartAttempt, program: Program, read: inputs.Inputs) -> str:
-    """Close a head start that differs from the compiled program. Return how the router starts, as in STARTS."""
-    from router.carrier.image import image_of
-    from router.library import library
-
-    if attempt.head_start is None:
-        return "refused" if attempt.why else "compiled"
-    if attempt.head_start.inputs == read.plain() and attempt.head_start.matches(*image_of(library(), program)):
-        return "kept"
-    logger.warning("an input has changed since the start: the compiled program replaces the kept one")
-    attempt.close()
-    return "replaced"
 
 
 def _table(args: argparse.Namespace, name: str, parameter: str | None) -> Path:
@@ -134,11 +119,10 @@ def route(
     ros_args: Sequence[str],
     environ: Mapping[str, str],
     attempt: HeadStartAttempt | None = None,
-    keeper: Keeper | None = None,
-    start: str = "compiled",
+    saver: ImageSaver | None = None,
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run a program until SIGINT or SIGTERM. Calls `started` once it runs; `Router` has the other arguments.
+    """Run a program until SIGINT or SIGTERM, after the head start of `attempt`. Calls `started` once it runs.
 
     Raises StartError.
     """
@@ -148,7 +132,8 @@ def route(
 
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_ENDING, signal.SIGHUP, signal.SIGUSR1})
     head_start = attempt.head_start if attempt is not None else None
-    router = Router(program, ["--ros-args", *ros_args], environ, head_start, keeper, start)
+    is_refused = attempt is not None and bool(attempt.why)
+    router = Router(program, ["--ros-args", *ros_args], environ, head_start, saver, is_refused=is_refused)
     if attempt is not None:
         attempt.pass_on()
     with router:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from router.compiler import Checked
     from router.compiler.lookup import Definitions
+    from router.compiler.metrics import Counters
     from router.compiler.program import Program
     from router.datagrams import Wire
     from router.table.model import RouteTable
@@ -76,17 +77,21 @@ def table_if_any(args: argparse.Namespace) -> Path | None:
 
 
 def good_table(
-    path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
+    path: Path,
+    environ: Mapping[str, str] | None = None,
+    definitions: Definitions | None = None,
+    counters: Counters | None = None,
 ) -> tuple[Checked, Program]:
-    """Check a table and print its warnings. Raises TableError if it has errors."""
+    """Check a table and print its warnings. The program counts in `counters`. Raises TableError if there are errors."""
     from router.cli.findings import print_findings
     from router.compiler import check_table
 
     checked = check_table(path, environ, definitions)
-    if checked.program is None:
+    program = checked.program if counters is None else checked.program_in(counters)
+    if program is None:
         raise TableError(checked.diagnostics)
     print_findings(checked.diagnostics, sys.stderr)
-    return checked, checked.program
+    return checked, program
 
 
 def add_tables(parser: argparse.ArgumentParser, about: str) -> None:

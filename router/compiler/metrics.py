@@ -450,6 +450,15 @@ class Counters:
         for (metric, *labels), index in self._indexes.items():
             yield Series(metric, tuple(labels)), index
 
+    def indexes(self) -> list[tuple[tuple[str, ...], int]]:
+        """Return the first index of every series, by metric and labels. `Counters.of` makes equal counters."""
+        return [*self._indexes.items()]
+
+    @classmethod
+    def of(cls, indexes: Iterable[tuple[tuple[str, ...], int]], size: int) -> Counters:
+        """Return counters with these indexes, none of which is current yet."""
+        return cls(dict(indexes), _size=size)
+
     def new_runs(self, earlier: Counters) -> Iterator[slice]:
         """Yield the indexes of each series that `earlier` lacks. These counters must continue `earlier`."""
         for series in self._indexes.keys() - earlier._indexes.keys():
@@ -475,15 +484,17 @@ class Counters:
         totals never decrease.
         """
         lists = list(threads)
-        for series in [series for series in self._indexes if series not in self._current]:
+        left = self._indexes.copy()  # other threads may iterate over the present ones
+        for series in self._indexes.keys() - self._current:
             run = self._run(series)
             if _BY_NAME[series[0]].kind in _COUNTED and any(any(counts[run]) for counts in lists):
                 continue
             length = run.stop - run.start
             for counts in lists:
                 counts[run] = [0] * length
-            del self._indexes[series]
+            del left[series]
             self._free.setdefault(length, []).append(run.start)
+        self._indexes = left
 
 
 _COUNTED = ("counter", "histogram")

@@ -65,7 +65,7 @@ class GatewayChange:
 class GatewayThread:
     """Serves the gateways of a program, and changes to those of another one.
 
-    `prepare` opens new gateways, `retire` closes obsolete ones, `finish` starts the new services; `abandon` undoes the
+    `prepare` opens new gateways, `adopt` closes obsolete ones, `finish` starts the new services; `undo` undoes the
     change instead. `library` is the carrier's. `counts` belong to this thread, which calls all callbacks.
     `kernel_drops` has, for each gateway that receives datagrams, a thread-safe function that returns how many the
     kernel has dropped. `refused` counts refused connections (see Door).
@@ -133,15 +133,15 @@ class GatewayThread:
                     change.opened.append(service)
                     change.services[service.name] = service
         except BaseException:
-            await self._abandon(change)
+            await self._undo(change)
             raise
         return change
 
-    def abandon(self, change: GatewayChange) -> None:
+    def undo(self, change: GatewayChange) -> None:
         """Close the gateways that `prepare` opened, and reopen those that it closed."""
-        self._call(self._abandon(change))
+        self._call(self._undo(change))
 
-    async def _abandon(self, change: GatewayChange) -> None:
+    async def _undo(self, change: GatewayChange) -> None:
         await _close(change.opened)
         async with AsyncExitStack() as opening:  # all of them, even if one raises
             for service in change.unused:
@@ -154,8 +154,8 @@ class GatewayThread:
         again.start()
         self._services[again.name] = again
 
-    def retire(self, change: GatewayChange) -> None:
-        """Close the services of `unused`. `abandon` can still reopen them."""
+    def adopt(self, change: GatewayChange) -> None:
+        """Close the services of `unused`. `undo` can still reopen them."""
         self._call(_close(change.unused))
 
     def finish(self, change: GatewayChange) -> None:

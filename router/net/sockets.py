@@ -120,7 +120,8 @@ class ListeningSocket:
 
     While its address or interface is missing, for example that of a tunnel that comes up later, it `is_waiting`: the
     socket is not bound and receives nothing, and `address` is the wanted one. Any other failure raises OSError.
-    `has_senders`: senders bound to its port are open. `receive_buffer` is the granted size in bytes.
+    `has_senders`: senders bound to its port are open. `receive_buffer` is the granted size in bytes. `wanted` are the
+    address and the interface that it was opened for.
     """
 
     def __init__(
@@ -131,6 +132,7 @@ class ListeningSocket:
         self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.interface = interface
         self.address = address
+        self.wanted = address, interface
         self.is_waiting = False
         try:
             if handed_over is not None:
@@ -162,6 +164,9 @@ class ListeningSocket:
         self.receive_buffer = receive_buffer(self.socket)
         if not self.is_inherited or self.receive_buffer < size:
             self.receive_buffer = ask_for_receive_buffer(self.socket, size)
+
+    def close(self) -> None:
+        self.socket.close()
 
     def has_lost_interface(self) -> bool:
         """Return whether its interface is gone. It then receives nothing, even if one of that name reappears.

@@ -29,8 +29,8 @@ class RouterNode:
     The event thread calls `subscriber_joined(topic)`. While a topic has peers with an incompatible QoS, and for some
     seconds afterwards, it calls `incompatible(topic, policy, peers)` once per second.
 
-    Topics are replaced in four steps: `prepare` opens new endpoints, `apply` uses them, `watch` waits for their events,
-    `finish` closes the unused ones. After `prepare`, `abandon` undoes it.
+    Topics are replaced in three steps: `prepare` opens new endpoints, `adopt` uses them and waits for their events,
+    `finish` closes the unused ones. After `prepare`, `undo` undoes it.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -104,7 +104,7 @@ class RouterNode:
                 subscription.await_publishers()
         return RosChange(publications, kept, [*published, *subscribed])
 
-    def abandon(self, change: RosChange) -> None:
+    def undo(self, change: RosChange) -> None:
         """Close the endpoints that `prepare` has opened."""
         for opened in change.opened:
             opened.close()
@@ -125,16 +125,13 @@ class RouterNode:
             if seconds := publication.stalled():
                 yield topic, seconds
 
-    def apply(self, change: RosChange) -> None:
-        """Use the endpoints of the change."""
+    def adopt(self, change: RosChange) -> None:
+        """Use the endpoints of the change: wait for their events, and update `wanted` from now on."""
         change.unused = [
             *unused(change.publications, self._publications),
             *unused(change.subscriptions, self._subscriptions),
         ]
         self._use(change)
-
-    def watch(self, change: RosChange) -> None:
-        """Wait for events of the endpoints in use, and update `wanted` from now on."""
         if change.unused or change.opened:
             self._events.stop()
             self._events = self._event_thread()

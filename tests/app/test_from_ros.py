@@ -221,7 +221,7 @@ def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
     site: Site, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with site.router(drive()) as router, capture_logs() as logs:
-        ros = router._runtime._ros
+        ros = router._runtime.topics.node
         assert ros is not None
         stop = FromRosThread.stop
         monkeypatch.setattr(FromRosThread, "stop", lambda thread: stop(thread) and False)

@@ -60,7 +60,7 @@ def test_clients_that_read_nothing_cost_little_and_nothing_once_they_have_left(s
             peer = opened.enter_context(closing(Publisher(f"map{number}", STRING, *options)))
             peer.publish(map(cdr, CONTENTS))
         router = opened.enter_context(site.router(ROUTES + gateways(kind, port)))
-        thread = router._runtime.gateways
+        thread = router._runtime.gateways.thread
         assert thread is not None
         fetches = thread._subscriptions.fetches
         for _ in range(2):
@@ -80,7 +80,7 @@ def test_clients_that_read_nothing_cost_little_and_nothing_once_they_have_left(s
 
 
 def backlogs(router: Router) -> list[float]:
-    gateways = router._runtime.gateways
+    gateways = router._runtime.gateways.thread
     assert gateways is not None
     return [value for _, value in gateways.clients(lambda queue: queue.client.backlog())]
 

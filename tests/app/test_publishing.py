@@ -37,7 +37,7 @@ def subscriber() -> Iterator[Subscriber]:
 
 def await_subscriber(router: Router, subscriber: Subscriber) -> None:
     """Both sides know each other."""
-    ros = router._runtime._ros
+    ros = router._runtime.topics.node
     assert ros is not None
     assert subscriber.line() == "matched"
     wait_until(lambda: ros.wanted["published_ph"][0])

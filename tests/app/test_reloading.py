@@ -12,7 +12,8 @@ import socket
 import threading
 from collections.abc import Callable
 from time import sleep, time
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import ANY
 from urllib.request import urlopen
 
@@ -20,11 +21,13 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.app import Router, reloading, watching
+from router.app.change import Change
 from router.app.counts import ThreadCounts
 from router.app.plane import Plane
 from router.app.watching import watched_files
 from router.compiler import check_table
 from router.compiler.metrics import Counters
+from router.compiler.program import Program
 from router.observe.http import HttpServer
 from router.observe.snapshot import Snapshot, parse_metrics, snapshot
 from tests.acceptance.site import wait_until
@@ -550,16 +553,20 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
             hearing.recv(1000)
 
 
+def adoption_of(counters: Counters) -> Change:
+    return Change(cast("Program", SimpleNamespace(counters=counters)), None, is_first=False)
+
+
 def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
     counts = ThreadCounts(Counters())
     abandoned = counts.counters.continued()
     index = abandoned.index("datagrams_padded", "another")
-    counts.make_room(abandoned)
+    counts.prepare(adoption_of(abandoned))
     counts.gateways[index] += 1
     then = counts.counters.continued()
     assert then.index("datagrams_received", "rover") == index
-    counts.make_room(then)
-    counts.replace(then)
+    for step in (counts.prepare, counts.adopt, counts.finish):
+        step(adoption_of(then))
     assert counts.total("datagrams_received") == 0
 
 

@@ -20,16 +20,16 @@ from structlog.testing import capture_logs
 
 from router import threads
 from router.app import Router
-from router.app.keeping import Keeper
+from router.app.gateways import Gateways
+from router.app.image_saver import ImageSaver
 from router.app.plane import Plane
 from router.app.runtime import Runtime
-from router.carrier.carrier import Carrier
+from router.carrier.forwarding_threads import ForwardingThreads
 from router.carrier.publishing import PublishThread
 from router.compiler.metrics import REJECT_REASONS
 from router.declared import MAX_DATAGRAM
 from router.errors import StartError
 from router.inputs import Inputs
-from router.library import load
 from router.observe.http import HttpServer
 from router.observe.snapshot import snapshot
 from router.recording.mirror import Mirrored
@@ -276,11 +276,11 @@ def test_a_recording_for_which_there_is_no_thread_ends_nothing(site: Site, monke
 def test_a_program_for_which_there_is_no_thread_is_not_kept_and_ends_nothing(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper = Keeper(load(), Inputs(), Inputs(), None)
+    saver = ImageSaver(Inputs(), Inputs(), None)
     monkeypatch.setattr(threads, "Thread", NoThread)
-    with capture_logs() as logged, Router(site.program(ROUTE), keeper=keeper) as router:
+    with capture_logs() as logged, Router(site.program(ROUTE), saver=saver) as router:
         assert router.reload().ok
-    why = [(entry["log_level"], entry["why"]) for entry in logged if "is not kept" in entry["event"]]
+    why = [(entry["log_level"], entry["why"]) for entry in logged if "is not saved" in entry["event"]]
     assert why == [("warning", "can't start new thread")]
 
 
@@ -334,7 +334,7 @@ def test_a_scrape_reads_what_was_published_before_what_was_received(
     """Else what is received and published in between would be published without having waited."""
     read: list[str] = []
 
-    def noted(kind: type[Carrier | PublishThread]) -> None:
+    def noted(kind: type[ForwardingThreads | PublishThread]) -> None:
         original = kind.counters
 
         def note(of: Any, size: int) -> Any:
@@ -343,11 +343,11 @@ def test_a_scrape_reads_what_was_published_before_what_was_received(
 
         monkeypatch.setattr(kind, "counters", note)
 
-    noted(Carrier)
+    noted(ForwardingThreads)
     noted(PublishThread)
     with Router(site.program(ROUTE)) as router:
         list(router.collect())
-    assert read == ["PublishThread", "Carrier"]
+    assert read == ["PublishThread", "ForwardingThreads"]
 
 
 def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
@@ -404,7 +404,7 @@ def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypat
 
         assert stalled() == {"ph": 0, "other": 0}
         monkeypatch.setattr(runtime.plane, "stalled", lambda: iter([("ph", 2.5)]))
-        monkeypatch.setattr(runtime._ros, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
+        monkeypatch.setattr(runtime.topics.node, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
         assert stalled() == {"ph": 2.5, "other": 0}
 
 
@@ -461,7 +461,7 @@ def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program
         plane = router._runtime.plane
         site.send(NAN_PH)
         wait_until(lambda: router.totals()["messages_dropped"] == 1)
-        generation = plane.now.native.generation if plane.now else 0
+        generation = plane.now.image.generation if plane.now else 0
         told = [plane._where_refused("ph_info", None, "ph", each, 1) for each in (generation, generation + 1)]
     place = f"{router.program.table.path}:16:15: when"
     assert told == [place, ""]
@@ -512,20 +512,23 @@ def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize("place", ["_stop_plane", "_stop_gateways", "_end_client_deadmen", "_stop_ros"])
+@pytest.mark.parametrize(
+    ("owner", "place"),
+    [(Runtime, "_stop_plane"), (Gateways, "close"), (Runtime, "_end_client_deadmen"), (Runtime, "_stop_ros")],
+)
 def test_whatever_is_stuck_at_the_stop_the_brake_is_sent(
-    site: Site, monkeypatch: pytest.MonkeyPatch, place: str
+    site: Site, monkeypatch: pytest.MonkeyPatch, owner: type, place: str
 ) -> None:
     goes_on, has_ended = threading.Event(), threading.Event()
-    stop = getattr(Runtime, place)
+    stop = getattr(owner, place)
 
-    def stuck(runtime: Runtime) -> None:
+    def stuck(stopped: object) -> None:
         goes_on.wait()
-        stop(runtime)
+        stop(stopped)
         has_ended.set()
 
     monkeypatch.setattr(threads, "STEP_S", 0.1)
-    monkeypatch.setattr(Runtime, place, stuck)
+    monkeypatch.setattr(owner, place, stuck)
     monkeypatch.setattr(HttpServer, "close", lambda _: goes_on.wait())
     more = f"http: {{address: 127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}}}\n"
     with capture_logs() as logs:

@@ -6,11 +6,11 @@ import ctypes
 from pathlib import Path
 
 from router.carrier.build import build, is_current
-from router.carrier.schema import wire_schema
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope
+from router.image.wire_schema import write_schema
 from router.library import load
 from tests.carrier.delivering import Payload
 from tests.oracles.envelopes import Decision
@@ -59,7 +59,7 @@ class CarrierSide:
 
     def __init__(self, library: ctypes.CDLL, made: Program) -> None:
         self._memory = Arrays()
-        self._schema = wire_schema(made.envelope, made.inbound, self._memory)
+        self._schema = write_schema(made.envelope, made.inbound, self._memory)
         self._read = library.envelope_read
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.limits import period
+from router.carrier.owned import OwnedPointer, open_native
 from router.carrier.reasons import LOSSES
-from router.carrier.state import Native, open_native
+from router.image.openings import period
 from router.table.model import Priority
 from tests.carrier.building import MEMORY, sanitizing
 
@@ -67,8 +67,10 @@ class Deferring:
         self.now = 0
         self._library, self._functions = library, functions
         self._address: int = functions.seam_open()
-        self._pacer = Native(library.pacer_close, open_native(library, "pacer_open", bandwidth)) if bandwidth else None
-        self._deferrals: list[Native] = []
+        self._pacer = (
+            OwnedPointer(library.pacer_close, open_native(library, "pacer_open", bandwidth)) if bandwidth else None
+        )
+        self._deferrals: list[OwnedPointer] = []
         self._are_topics: list[bool] = []
         self._error = 0
 
@@ -81,7 +83,7 @@ class Deferring:
             self._functions.seam_adopt(self._address, self._pacer.address, 0)
         pacer = None if is_topic else self._pacer
         address = open_native(self._library, "deferral_open", pacer.address if pacer else None)
-        self._deferrals.append(Native(self._library.deferral_close, address, pacer))
+        self._deferrals.append(OwnedPointer(self._library.deferral_close, address, pacer))
         return self._add(self._deferrals[-1], hertz, priority, is_topic=is_topic)
 
     def change(self, target: int, hertz: float | None, priority: Priority = Priority.COMMAND) -> int:
@@ -89,7 +91,7 @@ class Deferring:
         self._deferrals.append(self._deferrals[target])
         return self._add(self._deferrals[target], hertz, priority, is_topic=self._are_topics[target])
 
-    def _add(self, deferral: Native, hertz: float | None, priority: Priority, *, is_topic: bool) -> int:
+    def _add(self, deferral: OwnedPointer, hertz: float | None, priority: Priority, *, is_topic: bool) -> int:
         self._are_topics.append(is_topic)
         between = period(hertz) if hertz else 0
         rank = c.Priority[priority.name]

@@ -11,14 +11,14 @@ from typing import NamedTuple, Union
 
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
-from router.carrier.collectors import native_collect
+from router.carrier.owned import OwnedPointer, open_native
 from router.carrier.reasons import LOSSES
-from router.carrier.ros_routes import native_for_each
-from router.carrier.state import Native, open_native
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
 from router.declared import NONE
+from router.image.targets import write_collect
+from router.image.writer import write_for_each
 from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"
@@ -120,14 +120,14 @@ class Delivering:
         self._route: c.RosRoute | None = None
         if isinstance(lowered, LoweredFeed):
             self._route = c.RosRoute(
-                for_each=native_for_each(lowered.for_each, routines), seconds=NONE, nanoseconds=NONE
+                for_each=write_for_each(lowered.for_each, routines), seconds=NONE, nanoseconds=NONE
             )
         self._adopted = (c.Adoption * 1)(c.Adoption(to=ctypes.pointer(self._targets)))
         if isinstance(lowered, LoweredRoute) and lowered.collect is not None:
             address = open_native(functions, "collector_open", timeout)
-            collector = Native(functions.collector_close, address)
+            collector = OwnedPointer(functions.collector_close, address)
             self._adopted[0].timer = ctypes.cast(collector.address, ctypes.POINTER(c.Timer))
-            collect = native_collect(lowered.collect, routines, range(1 + len(others)))
+            collect = write_collect(lowered.collect, routines, range(1 + len(others)))
             collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
             self._arrays.keep(collector)

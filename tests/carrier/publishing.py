@@ -12,17 +12,14 @@ from time import monotonic, sleep
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router import declared as c
-from router.carrier.carrier import Carrier
 from router.carrier.deadmen import Deadmen
-from router.carrier.deferrals import timer_change
-from router.carrier.names import Names
-from router.carrier.outlets import Outlets
-from router.carrier.program import NativeProgram, change_to, native_program
+from router.carrier.forwarding_threads import ForwardingThreads
+from router.carrier.loading import LoadedImage
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
-from router.carrier.state import State
 from router.compiler.program import Program
+from router.image.names import Names
+from router.image.writer import write_image
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 12
@@ -71,23 +68,24 @@ class Publishing:
         self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack, queue: int = 1 << 16
     ) -> None:
         self.program = program
-        self._library, self._state = library, State(library)
+        self._library = library
         self._received, self._published, self._braked = ((c_int64 * MOST_COUNTERS)() for _ in range(3))
         self._names = Names()
         self._events, self._ring = Ring(library, 1 << 16), Ring(library, queue)
         self.publishers = {plan.label: Publisher(functions) for plan in program.publishers}
-        self._deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self._names)
+        self._deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12))
         self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
         self._peer = stack.enter_context(_bound())
-        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring)
+        self._carrier = ForwardingThreads(
+            library, self._deadmen.address, self._received, Ring(library, 1 << 16), self._ring
+        )
         self._programs = [self._made(program, 1)]  # all of them, because an abandoned thread may use any
-        self._changes: list[c.PublishChange] = []
         addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
         self.thread = PublishThread(library, self._ring, self._published, self._events, self._names)
         self.thread.start(cast("Any", addresses))
         stack.callback(self._close)
         self._change_topics()
-        self._carrier.start(change_to(self._programs[0], timer_change(())))
+        self._carrier.start(self._programs[0].change())
         self.sent = 0
 
     def send(self, *datagrams: bytes, listener: str = "exact") -> None:
@@ -99,17 +97,14 @@ class Publishing:
 
     def change(self, generation: int, program: Program | None = None) -> None:
         """Receive with another program from now on; the publish thread follows."""
-        self._state = State(self._library, self._state)
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
-        self._carrier.change(change_to(self._programs[-1], timer_change(())))
+        self._carrier.change(self._programs[-1].change(self._programs[-2]))
         self.thread.advance(generation)
 
     def _change_topics(self) -> None:
-        made, before = self._programs[-1], self._programs[-2].states.adopted if len(self._programs) > 1 else ()
-        timers = timer_change(made.states.adopted, before)
-        self._changes.append(c.PublishChange(timers=timers, generation=made.generation))
-        self.thread.change(self._changes[-1])
+        before = self._programs[-2] if len(self._programs) > 1 else None
+        self.thread.change(self._programs[-1].topic_change(before))
 
     def stop_receiving(self) -> None:
         self._carrier.stop_receiving()
@@ -146,20 +141,15 @@ class Publishing:
         """The topic whose publisher blocks the thread, and for how many seconds; else None."""
         return self.thread.stalled()
 
-    def _made(self, program: Program, generation: int) -> NativeProgram:
-        listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
-        outlets = Outlets(
-            program=program,
-            library=self._library,
-            state=self._state,
-            names=self._names,
-            listeners=cast("Any", listening),
-            senders={},
-            publications=self.publishers,
-            deadmen={},
-            bandwidths={},
+    def _made(self, program: Program, generation: int) -> LoadedImage:
+        before = self._programs[-1] if generation > 1 else None
+        image = write_image(program, self._names)
+        loaded = LoadedImage(self._library, image, {}, self._deadmen.address, generation, before)
+        loaded.bind_topics(self.publishers)
+        loaded.bind_listeners(
+            {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
         )
-        return native_program(program, generation, outlets)
+        return loaded
 
 
 def wait_until(condition: Callable[[], object]) -> None:

@@ -13,17 +13,15 @@ from pathlib import Path
 from struct import Struct
 from typing import Any
 
-from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.deadmen import Deadmen
-from router.carrier.deferrals import timer_change
 from router.carrier.from_ros import FromRosThread
-from router.carrier.names import Names
-from router.carrier.outlets import Outlets
+from router.carrier.loading import LoadedImage
 from router.carrier.ring import Ring
-from router.carrier.ros_routes import native_from_ros
-from router.carrier.state import State
+from router.carrier.ros_routes import RosRoutes
 from router.compiler.program import Program
+from router.image.names import Names
+from router.image.writer import write_image
 from tests.small_tables import Ledger
 
 MOST_COUNTERS = 1 << 16
@@ -136,17 +134,11 @@ class ServingRos:
         self.boards = {endpoint.name: Board(library) for endpoint in program.senders}
         for board in self.boards.values():
             stack.callback(board.close)
-        self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self.names)
-        state = State(library)
-        boards = NativeBoards(program.boards)
-        outlets = Outlets.of(
-            program, self.deadmen, state, listeners={}, senders=self.boards, publications={}, boards=boards
-        )
-        self.by_route = outlets.deadmen
-        self.messages = native_from_ros(program, 1, outlets)
-        self.messages.arrays.keep(outlets)
-        timers = timer_change([*outlets.pacers(), *self.messages.states.adopted])
-        library.timers_change(self.deadmen.address, ctypes.byref(timers))
+        self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12))
+        image = LoadedImage(library, write_image(program, self.names), self.boards, self.deadmen.address, 1)
+        self.by_route = image.deadmen
+        self.messages = RosRoutes.of(image)
+        library.timers_change(self.deadmen.address, ctypes.byref(image.timers(of_topics=False)))
         self.subscriptions = {topic: Subscription(functions) for topic in self.messages.topics}
         take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
         assert take

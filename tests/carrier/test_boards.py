@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.carrier.boards import NativeBoards
 from router.compiler.constants import envelope_of
+from router.compiler.lowering.arrays import Arrays
 from router.compiler.mapping import build
 from router.declared import BoardRefusal, Loss
 from router.errors import Located, SourceSpan
+from router.image.boards import write_boards
 from router.table.model import FieldMap
 from router.types.board_limits import BoardLimits, board_fields, scalars
 from router.types.model import MessageType
@@ -48,12 +49,13 @@ class Boards:
         self.limits = {
             name: BoardLimits(fields, longest, allows) for name, allows in {"strict": False, "lenient": True}.items()
         }
-        self._native = NativeBoards(self.limits)
+        self._memory = Arrays()
+        self._native = write_boards(self.limits, self._memory)
         self._takes = library.board_takes
 
     def carrier(self, data: bytes, board: str = "strict") -> Refusal | None:
         found = BoardRefusal()
-        if self._takes(self._native.pointer(board), data, len(data), ctypes.byref(found)):
+        if self._takes(self._native[board], data, len(data), ctypes.byref(found)):
             return None
         return Refusal(REASONS[found.reason], found.text.decode())
 

@@ -13,14 +13,15 @@ from typing import Any, cast
 
 import pytest
 
-from router.carrier.client_deadmen import ClientDeadman, ClientDeadmen
-from router.carrier.names import Names
+from router.carrier.client_deadmen import ClientDeadmen
+from router.carrier.deadmen import NativeDeadman
 from router.carrier.ring import Ring
-from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
+from router.image.names import Names
 from tests.carrier.building import MEMORY, RACES, run_program
+from tests.carrier.opening import opened_deadman
 from tests.carrier.publishing import Publisher, wait_until
 from tests.carrier.serving_ros import middleware
 
@@ -51,12 +52,14 @@ class Clients:
 
     def add(
         self, topic: str = "/word", timeout_ms: int = 10, repeat_ms: int = NEVER_MS, *, at_start: bool = True
-    ) -> ClientDeadman:
+    ) -> NativeDeadman:
         if topic not in self.publishers:
             self.publishers[topic] = Publisher(self._functions)
         payload = (topic, (b"stop " + topic.encode(),))
         plan = DeadmanPlan(f"gateway:{topic}", timeout_ms * MS, repeat_ms * MS, (payload,), at_start)
-        return self.deadmen.get_or_open(plan, self._counters, self.publishers, State(self._library))
+        return opened_deadman(
+            self._library, self.deadmen.group, plan, self._counters, self._names, self.publishers, "publisher"
+        )
 
     def count(self, metric: str, topic: str = "/word") -> int:
         labels = (topic,) if metric in {"datagrams_sent", "send_errors"} else ()
@@ -93,7 +96,7 @@ def at_once(call: Callable[[], object]) -> None:
     assert not thread.is_alive()
 
 
-def get_stuck(clients: Clients, topic: str = "/word") -> ClientDeadman:
+def get_stuck(clients: Clients, topic: str = "/word") -> NativeDeadman:
     """Have the thread publish on a topic, and not come back."""
     deadman = clients.add(topic)
     clients.publishers[topic].impede(is_stuck=True)

@@ -15,7 +15,6 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
 from struct import Struct
 from typing import cast
@@ -26,15 +25,16 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router import declared as c
-from router.carrier.deadmen import Deadmen, NativeDeadman, feed_of, successors
-from router.carrier.names import Names
+from router.carrier.deadmen import Deadmen, NativeDeadman, successors
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
-from router.carrier.state import State
 from router.clock import boottime_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
+from router.image.names import Names
+from router.image.openings import feed_of
 from tests.carrier.building import MEMORY, RACES, run_program
+from tests.carrier.opening import opened_deadman
 from tests.oracles import deadman as oracle
 from tests.oracles.deadman import GREETING, START, START_AGAIN, Event
 from tests.readable import readable
@@ -102,12 +102,14 @@ class NativeSide:
         self._names = Names()
         self._plans: WeakKeyDictionary[NativeDeadman, DeadmanPlan] = WeakKeyDictionary()
         self._ring = Ring(library, event_bytes)
-        self.deadmen = Deadmen(library, self.counts, self._ring, self._names)
+        self.deadmen = Deadmen(library, self.counts, self._ring)
         self._heard = (ctypes.c_int64 * 100)()
         seams.seam_hear(self.deadmen.address, self._heard)
 
     def add(self, plan: DeadmanPlan) -> NativeDeadman:
-        made = self.deadmen.get_or_open(plan, self._counters, senders(self._outlets), State(self._library))
+        made = opened_deadman(
+            self._library, self.deadmen.address, plan, self._counters, self._names, senders(self._outlets)
+        )
         self._plans[made] = plan
         return made
 
@@ -124,7 +126,7 @@ class NativeSide:
         self._library.command_send_at(deadmen, to, data, len(data), NEVER, array, len(feeds), now)
 
     def _feeds(self, feeds: Sequence[tuple[NativeDeadman, bool]], endpoint: str) -> ctypes.Array[c.Feed]:
-        made = [feed_of(self._plans[each], each, endpoint, disarms=disarms) for each, disarms in feeds]
+        made = [feed_of(self._plans[each], each.address, endpoint, disarms=disarms) for each, disarms in feeds]
         return (c.Feed * len(feeds))(*made)
 
     def commander(
@@ -457,8 +459,8 @@ def test_one_that_was_replaced_keeps_its_successors_alive(side: NativeSide) -> N
     assert side.next_due == NEVER
 
 
-def watching(route: str, *sources: str) -> DeadmanPlan:
-    return replace(PLAN, route=route, watched=frozenset((source, "drive") for source in sources))
+def watching(route: str, *sources: str) -> tuple[str, list[str], list[tuple[str, str]]]:
+    return route, [], [(source, "drive") for source in sources]
 
 
 @pytest.mark.parametrize(

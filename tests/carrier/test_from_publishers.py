@@ -23,13 +23,12 @@ from rclpy.node import Node
 
 from router.carrier.deadmen import Deadmen
 from router.carrier.from_ros import FromRosThread
-from router.carrier.names import Names
-from router.carrier.outlets import Outlets
+from router.carrier.loading import LoadedImage
 from router.carrier.ring import Ring
-from router.carrier.ros_routes import native_from_ros
+from router.carrier.ros_routes import RosRoutes
 from router.carrier.sender import NativeSender
-from router.carrier.state import State
 from router.compiler.program import Program
+from router.image.writer import write_image
 from router.net.udp import open_sending
 from router.ros.node import close_node, open_node
 from router.ros.qos import qos_profile
@@ -88,32 +87,19 @@ def router(library: ctypes.CDLL, node: Node, tmp_path: Path) -> Iterator[Router]
         board.bind(("127.0.0.1", 0))
         board.settimeout(20)
         made = program(tmp_path, ROUTES, HEAD.replace("PORT", str(board.getsockname()[1])))
-        names = Names()
         senders = {to.name: NativeSender(library, to.address.value, open_sending(to)) for to in made.senders}
         for sender in senders.values():
             stack.callback(sender.close)
         counters = (ctypes.c_int64 * (1 << 12))()
-        deadmen = Deadmen(library, (ctypes.c_int64 * (1 << 12))(), Ring(library, 1 << 12), names)
-        outlets = Outlets(
-            program=made,
-            library=library,
-            state=State(library),
-            names=names,
-            listeners={},
-            senders=senders,
-            publications={},
-            deadmen={
-                plan.route: deadmen.get_or_open(plan, made.counters, senders, State(library)) for plan in made.deadmen
-            },
-            bandwidths={},
-        )
+        deadmen = Deadmen(library, (ctypes.c_int64 * (1 << 12))(), Ring(library, 1 << 12))
+        image = LoadedImage(library, write_image(made), senders, deadmen.address, 1)
         (plan,) = made.subscriptions
         subscription = RawSubscription(node, installed_class(TYPE), plan.topic, qos_profile(plan.qos))
         stack.callback(subscription.close)
         thread = FromRosThread(library, deadmen.address, counters, Ring(library, 1 << 12))
         thread.start(TAKE, RESET)
         stack.callback(thread.stop)
-        thread.serve(native_from_ros(made, 1, outlets, {plan.label: subscription}))
+        thread.serve(RosRoutes.of(image, {plan.label: subscription}))
         yield Router(made, library, thread, deadmen, board)
 
 

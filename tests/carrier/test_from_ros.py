@@ -13,7 +13,7 @@ from time import monotonic, sleep
 
 import pytest
 
-from router.carrier.ros_routes import NativeFromRos
+from router.carrier.ros_routes import RosRoutes
 from router.clock import boottime_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
@@ -354,7 +354,7 @@ def test_a_subscription_that_is_left_is_emptied_before_and_not_used_afterwards(
 
 def test_what_came_before_a_topic_is_served_is_served_then(opened: Open) -> None:
     serving = opened()
-    serving.thread.serve(NativeFromRos())
+    serving.thread.serve(RosRoutes())
     serving.subscriptions["drive"].put(drive(1), wall_ns())
     assert serving.count("messages_received", "drive_motor", "drive") == 0
     serving.serve()

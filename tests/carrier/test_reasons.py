@@ -13,7 +13,6 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
-from router.carrier.names import Names
 from router.carrier.reasons import LOSSES, REJECTIONS
 from router.carrier.rehearsal import Stage
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report
@@ -21,6 +20,7 @@ from router.compiler.program import Program
 from router.compiler.refusals import _WORDS
 from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
+from router.image.names import Names
 from router.library import library
 from router.observe.reports import Reporter
 from router.table.addresses import Address

@@ -14,7 +14,8 @@ import pytest
 from router import inputs
 from router.cli import OK, main
 from router.compiler import check_table
-from router.kept import store
+from router.image.image import Image
+from router.startup_image import store
 from tests.acceptance.site import ROOT, wait_until
 from tests.ports import free_port
 from tests.routers import MODULE, start
@@ -95,7 +96,7 @@ def keep(table: Path, *command: str) -> None:
         patch.setattr(sys, "argv", list(command))
         with inputs.recording() as read:
             assert check_table(table).program is not None
-        store.write(read.plain(), {}, b"")
+        store.write(read.plain(), Image())
 
 
 Told = Callable[[Path], list[str]]

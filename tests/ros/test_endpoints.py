@@ -29,8 +29,7 @@ def speaker() -> Iterator[RouterNode]:
 def publish(ros: RouterNode, *plans: TopicPlan) -> None:
     """In place of what it publishes now."""
     made = ros.prepare(plans, [], SPANS)
-    ros.apply(made)
-    ros.watch(made)
+    ros.adopt(made)
     ros.finish(made)
 
 
@@ -58,6 +57,6 @@ def test_a_topic_keeps_its_type(speaker: RouterNode) -> None:
 
 def test_what_was_prepared_can_be_abandoned(speaker: RouterNode) -> None:
     made = speaker.prepare([string_topic(DEEP), string_topic(topic="farewell")], [], SPANS)
-    speaker.abandon(made)
+    speaker.undo(made)
     assert list(speaker.publish) == ["greeting"]
     wait_until(lambda: not speaker.topics.publishers("/farewell"))

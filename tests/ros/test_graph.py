@@ -101,8 +101,7 @@ def test_a_reload_marks_new_topics_and_no_longer_those_that_it_removes(opened: C
     opened(OtherRouter, "--ros-args", "-r", "__node:=another")
     with closing(open_ros(subscriptions=[string_topic(topic="old")])) as ros:
         change = ros.prepare([], [string_topic()], {"greeting": SPAN})
-        ros.apply(change)
-        ros.watch(change)
+        ros.adopt(change)
         ros.finish(change)
         wait_until(lambda: [name for _, _, name in shared(ros)] == ["greeting"])
         ours = {name for name, router in marks(ros.topics.names()) if router == this_router()}

@@ -146,8 +146,7 @@ def test_two_of_our_own_that_do_not_go_together_are_counted() -> None:
     ) as ros:
         apart.wait_for("reliability", "reliability")
         change = ros.prepare([string_topic(RELIABLE)], [string_topic(RELIABLE)], {"greeting": SPAN})
-        ros.apply(change)
-        ros.watch(change)
+        ros.adopt(change)
         ros.finish(change)
         apart.wait_for()
 

@@ -1,4 +1,4 @@
-/* A program: immutable arrays that router/carrier/program.py makes from a compiled table.
+/* A program: immutable arrays that router/image/writer.py makes from a compiled table.
  *
  * All arrays belong to the caller and must live until another program is adopted, the ring holds no message that points to
  * them, and the receive thread has made another turn since (`carrier_turns`): it may be dropping such a message. */

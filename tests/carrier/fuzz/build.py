@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from router.carrier.build import sources
-from router.carrier.schema import wire_schema
 from router.compiler.lowering.arrays import Arrays
 from router.declared import WireSchema
+from router.image.wire_schema import write_schema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table
 from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
@@ -40,7 +40,7 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     for index, schema in enumerate(SCHEMAS):
         made = table(schema, folder)
         memory = Arrays()
-        declarations += _arrays(index, wire_schema(made.envelope, made.inbound, memory))
+        declarations += _arrays(index, write_schema(made.envelope, made.inbound, memory))
         maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
         if schema == "rover":

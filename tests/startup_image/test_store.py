@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from router import inputs
-from router.kept import store
+from router.image.image import Image
+from router.startup_image import store
 
 IMAGE = bytes(range(256)) * 3
 PARTS = {"listeners": [("wifi", 5000)], "deadmen": b"\0brake", "ratio": 0.5, "none": None}
@@ -36,7 +37,7 @@ def only(folder: Path) -> Path:
 
 
 def keep(parts: object = PARTS, image: bytes = IMAGE) -> None:
-    store.write(UNCHANGED, parts, image)
+    store.write(UNCHANGED, Image(names=parts, memory=image))
 
 
 def refused() -> str:
@@ -51,28 +52,15 @@ def test_what_is_written_is_found(cache: Path) -> None:
     kept, reason = store.find()
     assert kept is not None
     assert reason == ""
-    assert (kept.inputs, kept.parts, kept.image[:]) == (UNCHANGED, PARTS, IMAGE)
+    assert (kept.inputs, kept.image.parts()["names"], kept.image.memory) == (UNCHANGED, PARTS, IMAGE)
     assert (cache.stat().st_mode & 0o777, only(cache).stat().st_mode & 0o777) == (0o700, 0o600)
-
-
-def test_the_image_is_memory_of_its_own_at_a_page() -> None:
-    import ctypes
-
-    keep()
-    kept, _ = store.find()
-    assert kept is not None
-    assert ctypes.addressof(ctypes.c_char.from_buffer(kept.image)) % resource.getpagesize() == 0
-    kept.image[0] = 77
-    again, _ = store.find()
-    assert again is not None
-    assert again.image[:] == IMAGE
 
 
 def test_a_program_without_an_image_is_kept_too() -> None:
     keep(image=b"")
     kept, _ = store.find()
     assert kept is not None
-    assert kept.parts == PARTS
+    assert kept.image.parts()["names"] == PARTS
 
 
 def test_the_next_one_replaces_it(cache: Path) -> None:
@@ -80,7 +68,7 @@ def test_the_next_one_replaces_it(cache: Path) -> None:
     keep("second")
     kept, _ = store.find()
     assert kept is not None
-    assert kept.parts == "second"
+    assert kept.image.parts()["names"] == "second"
     only(cache)
 
 
@@ -218,7 +206,7 @@ def test_a_whole_file_with_other_content_is_refused_with_a_reason(
     """It can only come of a bug; even that keeps no router from starting."""
     with monkeypatch.context() as unchecked:
         unchecked.setattr(inputs, "changed", lambda _: "")
-        store.write(strange, PARTS, IMAGE)  # type: ignore[arg-type]
+        store.write(strange, Image(names=PARTS, memory=IMAGE))  # type: ignore[arg-type]
     assert "cannot be read" in refused()
 
 
@@ -232,7 +220,7 @@ def test_a_program_whose_inputs_changed_since_they_were_read_is_not_kept(
             keep("after")
     kept, _ = store.find()
     assert kept is not None
-    assert kept.parts == "before"
+    assert kept.image.parts()["names"] == "before"
     only(cache)
 
 
@@ -295,9 +283,11 @@ def test_what_another_process_is_writing_stays_and_what_one_has_left_goes(cache:
 _WRITER = """
 import sys
 sys.argv = ["router", "run"]
-from router.kept import store
+from router.image.image import Image
+from router.startup_image import store
 for number in range(200):
-    store.write((("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),), number, bytes([number]) * 50_000)
+    image = Image(names=number, memory=bytes([number]) * 50_000)
+    store.write((("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),), image)
 """
 
 
@@ -308,7 +298,7 @@ def test_two_routers_that_write_at_once_leave_one_whole_file(cache: Path) -> Non
     while any(writer.poll() is None for writer in writers):
         kept, reason = store.find()
         assert kept is not None, reason
-        assert len({*kept.image[:]}) == 1 or kept.parts == PARTS
+        assert len({*kept.image.memory}) == 1 or kept.image.parts()["names"] == PARTS
         found += 1
     assert [writer.returncode for writer in writers] == [0, 0]
     assert found
@@ -332,21 +322,22 @@ def test_a_failed_write_leaves_what_was_kept(cache: Path) -> None:
     assert caught.value.errno == errno.EFBIG
     kept, _ = store.find()
     assert kept is not None
-    assert kept.parts == "before"
+    assert kept.image.parts()["names"] == "before"
     only(cache)
 
 
 _WITHOUT_ROOM = """
 import os, sys
 sys.argv = ["router", "run"]
-from router.kept import store
+from router.image.image import Image
+from router.startup_image import store
 unchanged = (("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),)
-store.write(unchanged, "before", b"image")
+store.write(unchanged, Image(names="before"))
 REMOUNT
 try:
-    store.write(unchanged, "after", bytes(100_000))
+    store.write(unchanged, Image(memory=bytes(100_000)))
 except OSError as error:
-    print(error.strerror, store.find()[0].parts, len(os.listdir(os.environ["XDG_CACHE_HOME"] + "/rover-router")))
+    print(error.strerror, store.find()[0].image.names, len(os.listdir(os.environ["XDG_CACHE_HOME"] + "/rover-router")))
 """
 
 
@@ -403,7 +394,7 @@ def test_a_changed_input_is_found_in_a_recording_that_was_written(tmp_path: Path
     table.write_text("version: 1\n")
     with inputs.recording() as read:
         inputs.read_text(table)
-    store.write(read.plain(), PARTS, IMAGE)
+    store.write(read.plain(), Image(names=PARTS, memory=IMAGE))
     kept, _ = store.find()
     assert kept is not None
     assert kept.inputs == read.plain()
@@ -411,7 +402,12 @@ def test_a_changed_input_is_found_in_a_recording_that_was_written(tmp_path: Path
     assert refused() == f"the file {table} has changed"
 
 
-_SMALL = "import sys; before = set(sys.modules); import router.kept.store; print(*sorted(set(sys.modules) - before))"
+_SMALL = """\
+import sys
+before = set(sys.modules)
+import router.startup_image.store
+print(*sorted(set(sys.modules) - before))
+"""
 
 
 def test_it_imports_small_modules_alone() -> None:
@@ -424,6 +420,9 @@ def test_it_imports_small_modules_alone() -> None:
         check=True,
     )
     ours = {name for name in answer.stdout.split() if name.partition(".")[0] == "router"}
-    assert ours == {"router", "router.inputs", "router.kept", "router.kept.store"}
+    assert ours == {
+        "router", "router.image", "router.image.image", "router.inputs", "router.startup_image",
+        "router.startup_image.store",
+    }  # fmt: skip
     heavy = {"pathlib", "re", "dataclasses", "inspect", "typing", "logging", "json", "hashlib", "argparse", "tempfile"}
     assert not heavy & set(answer.stdout.split())

@@ -16,15 +16,15 @@ from typing import Any
 import pytest
 
 from router.app import Router
-from router.carrier.carrier import Carrier
+from router.carrier.forwarding_threads import ForwardingThreads
 from router.compiler import check_table
 from router.compiler.metrics import Counters
 from router.compiler.program import Program
 from router.types.protobuf import PayloadCase
 from tests.acceptance.payloads import FRAME, WIRE, sample
 from tests.acceptance.site import udp, wait_until
-from tests.kept.test_head_start import head_start
 from tests.ports import free_port
+from tests.startup_image.test_head_start import head_start
 from tests.tables import PROTOS, ROUTES
 
 ROOT = Path(__file__).parents[2]
@@ -84,12 +84,11 @@ routes:
 DIGEST = """\
 import sys, zlib, marshal
 from pathlib import Path
-from router.carrier.image import image_of
-from router.library import library
 from router.compiler import check_table
+from router.image.writer import write_image
 for path in sys.argv[1:]:
-    parts, image = image_of(library(), check_table(Path(path)).program)
-    print(path, len(image), zlib.crc32(image), zlib.crc32(marshal.dumps(parts)))
+    image = write_image(check_table(Path(path)).program)
+    print(path, len(image.memory), zlib.crc32(marshal.dumps(image.parts())))
 """
 
 
@@ -137,7 +136,7 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
     every = [(source, listener, each) for each in datagrams for source in SOURCES for listener in LISTENERS]
     sent = [each for each in every if each[:2] != ("tool", "exact")]
 
-    def outcome(run: Callable[[Program], AbstractContextManager[Carrier]]) -> Outcome:
+    def outcome(run: Callable[[Program], AbstractContextManager[ForwardingThreads]]) -> Outcome:
         program = checked.program_in(Counters())
         assert program
         indexes = {
@@ -155,17 +154,17 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
         return Outcome(got, {f"{metric}{labels}": carrier.counts[at] for (metric, labels), at in indexes.items()})
 
     @contextmanager
-    def by_image(program: Program) -> Iterator[Carrier]:
+    def by_image(program: Program) -> Iterator[ForwardingThreads]:
         started = head_start(program)
         try:
-            yield started.forwarding.carrier
+            yield started.forwarding.threads
         finally:
             started.close()
 
     @contextmanager
-    def by_program(program: Program) -> Iterator[Carrier]:
+    def by_program(program: Program) -> Iterator[ForwardingThreads]:
         with Router(program) as router:
-            yield router._runtime.plane._carrier
+            yield router._runtime.plane._threads
 
     of_image, of_program = outcome(by_image), outcome(by_program)
     assert of_image.received == of_program.received
@@ -179,9 +178,13 @@ def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) ->
     checked = check_table(path)
     assert checked.program
     started = head_start(checked.program)
-    assert {kind for kind, *_ in started.opened} == {"deadman", "limit", "pacer", "deferral", "collect"}
+    opened = dict(started.image._opened)
+    kinds = {symbol[0] for symbol, *_ in started.image.image.openings}
+    assert kinds == {"deadman", "limit", "pacer", "deferral", "collector"}
     with Router(checked.program, head_start=started) as router, udp(SOURCES["tool"], ports["tool"]) as tool:
-        assert started.opened == {}
+        running = router._runtime.plane.image
+        assert running
+        assert running._opened == opened
         assert router.reload().ok
         datagram = sample("ph_info", _filled(WIRE.envelope.cases["ph_info"])).datagram
         with udp(SOURCES["basestation"], ports["basestation"]) as basestation:
@@ -189,7 +192,7 @@ def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) ->
             assert basestation.recv(2000) == datagram
 
 
-def _has_received(carrier: Carrier, program: Program, datagrams: int) -> bool:
+def _has_received(carrier: ForwardingThreads, program: Program, datagrams: int) -> bool:
     counts = carrier.counters(program.counters.size)
     return datagrams <= sum(counts[at] for series, at in program.counters.series() if series.metric == _RECEIVED)
 

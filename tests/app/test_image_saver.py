@@ -1,19 +1,17 @@
-"""Which program is kept at the end of several reloads."""
+"""Which image is stored at the end of several reloads."""
 
 from __future__ import annotations
 
 from threading import Event
-from typing import cast
 
 import pytest
 
-from router.app.keeping import Keeper
-from router.compiler.program import Program
+from router.app.image_saver import ImageSaver
+from router.image.image import Image
 from router.inputs import Inputs
-from router.kept import store
-from router.library import library
+from router.startup_image import store
 
-PROGRAM = cast("Program", object())
+IMAGE = Image()
 
 
 def reading(value: str) -> Inputs:
@@ -34,15 +32,14 @@ def test_a_table_that_is_restored_while_the_other_is_being_written_is_kept(monke
 
     monkeypatch.setattr(store, "write", write)
     monkeypatch.setattr(store, "clear_tries", has_ended.set)
-    monkeypatch.setattr("router.carrier.image.image_of", lambda *_: ((), b""))
-    keeper = Keeper(library(), Inputs(), first, first.plain())
-    keeper.keep(lambda: PROGRAM, first)  # as after a head start
+    saver = ImageSaver(Inputs(), first, first.plain())
+    saver.save(IMAGE, first)  # as after a head start
     assert has_ended.wait(20)
     has_ended.clear()
     for read in (second, first):
-        keeper.keep(lambda: PROGRAM, read)
+        saver.save(IMAGE, read)
         assert is_writing.wait(20)
     may_end.set()
-    keeper.keep(lambda: PROGRAM, first)
+    saver.save(IMAGE, first)
     assert has_ended.wait(20)
     assert written == [second.plain(), first.plain()]

@@ -29,8 +29,8 @@ _BY_TYPE: Mapping[int, WireKind] = {
 _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.I64, I32: WireKind.I32}
 
 
-def wire_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
-    """Make the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
+def write_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
+    """Write the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
     flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
     indexes = all_types(descriptor)

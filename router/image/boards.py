@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from google.protobuf.descriptor import FieldDescriptor
 
 from router import declared as c
-from router.carrier.schema import wire_kind
 from router.compiler.lowering.arrays import Arrays
 from router.declared import BoardFlag, WireKind
+from router.image.wire_schema import wire_kind
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.wire import LEN, encoding_of
 
@@ -21,26 +21,18 @@ _UNBOUNDED = (1 << 32) - 1
 _ZIGZAG = (FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64)
 
 
-class NativeBoards:
-    """A `struct board` for each endpoint that is a board. C may use them as long as this object lives."""
-
-    def __init__(self, boards: Mapping[str, BoardLimits]) -> None:
-        self.arrays = Arrays()
-        trees: dict[int, _Tree] = {}  # boards with the same firmware share one
-        self._boards: dict[str, c.Board] = {}
-        for name, limits in boards.items():
-            key = id(limits.fields)
-            if key not in trees:
-                trees[key] = _Tree(limits.fields, self.arrays)
-            board = c.Board(
-                messages=trees[key].messages, longest=limits.longest, allows_non_finite=limits.allows_non_finite
-            )
-            self._boards[name] = self.arrays.add(board)
-
-    def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
-        """Return the limits of an endpoint; None if it is not a board."""
-        board = self._boards.get(endpoint)
-        return ctypes.pointer(board) if board is not None else None
+def write_boards(boards: Mapping[str, BoardLimits], arrays: Arrays) -> Mapping[str, ctypes._Pointer[c.Board]]:
+    """Make a `struct board` for each endpoint that is a board. Boards with the same firmware share its fields."""
+    trees: dict[int, _Tree] = {}
+    made = {}
+    for name, limits in boards.items():
+        key = id(limits.fields)
+        if key not in trees:
+            trees[key] = _Tree(limits.fields, arrays)
+        messages, longest = trees[key].messages, limits.longest
+        board = c.Board(messages=messages, longest=longest, allows_non_finite=limits.allows_non_finite)
+        made[name] = ctypes.pointer(arrays.add(board))
+    return made
 
 
 class _Tree:

@@ -1,13 +1,12 @@
-"""The files of kept programs: one per command line, folder and Python; written atomically, private to their owner.
+"""The files of startup images: one per command line, folder and Python; written atomically, private to their owner.
 
-A file is a header, plain values in the format of `marshal`, and an image. A complete file of this user is trusted.
+A file is a header and plain values in the format of `marshal`. A complete file of this user is trusted.
 """
 
 from __future__ import annotations
 
 import errno
 import marshal
-import mmap
 import os
 import stat
 import struct
@@ -17,6 +16,7 @@ import zlib
 from contextlib import suppress
 
 from router import inputs
+from router.image.image import Image
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -43,22 +43,18 @@ _STALE = 60.0
 
 _MAGIC = b"rover router kept program\n"
 _FORMAT = 1
-_HEAD = struct.Struct(f"<{len(_MAGIC)}sIIQQ")
-"""The magic, the format, Python's version, the sizes of values and image. A checksum of everything else follows."""
+_HEAD = struct.Struct(f"<{len(_MAGIC)}sIIQ")
+"""The magic, the format, Python's version, the size of the values. A checksum of everything else follows."""
 _CHECKSUM = struct.Struct("<I")
 
 
-class Kept:
-    """The content of a complete file, written at `written` (wall clock, s).
+class Stored:
+    """The content of a complete file, written at `written` (wall clock, s): an image, compiled from `inputs`."""
 
-    `parts` are plain values. `image` is private, writable memory, aligned to a page.
-    """
-
-    def __init__(self, identity: Identity, written: float, read: Plain, parts: object, image: mmap.mmap) -> None:
+    def __init__(self, identity: Identity, written: float, read: Plain, image: Image) -> None:
         self.identity = identity
         self.written = written
         self.inputs = read
-        self.parts = parts
         self.image = image
 
 
@@ -69,20 +65,20 @@ class _UnusableError(Exception):
 _OF_ANOTHER = "it belongs to another command line, folder or Python"
 
 
-def find() -> tuple[Kept | None, str]:
+def find() -> tuple[Stored | None, str]:
     """Return the kept program of this command line, folder and Python, or why it is not used ("" if there is none)."""
     try:
-        kept, why = _inspect(_path(_identity()))
-        if kept is not None and kept.identity != _identity():
+        stored, why = _inspect(_path(_identity()))
+        if stored is not None and stored.identity != _identity():
             return None, _OF_ANOTHER
     except FileNotFoundError:
         return None, ""
     except Exception as error:  # noqa: BLE001 - after any error, the router starts without the file
         return None, f"it cannot be read: {error!r}"
-    return (None, why) if why else (kept, "")
+    return (None, why) if why else (stored, "")
 
 
-def list_files() -> Iterator[tuple[str, Kept | None, str]]:
+def list_files() -> Iterator[tuple[str, Stored | None, str]]:
     """Yield, newest first, each file's path, its content if complete, and why a start does not use it, or "".
 
     Raises OSError.
@@ -95,18 +91,18 @@ def list_files() -> Iterator[tuple[str, Kept | None, str]]:
         yield path, *content
 
 
-def _inspect(path: str) -> tuple[Kept | None, str]:
+def _inspect(path: str) -> tuple[Stored | None, str]:
     """Return the content of a complete file, and why a start does not use it, or "". Raises OSError."""
     try:
-        kept = _read(path)
+        stored = _read(path)
     except _UnusableError as error:
         return None, str(error)
-    change = inputs.changed(kept.inputs)
-    return kept, f"{change}{CHANGED}" if change else ""
+    change = inputs.changed(stored.inputs)
+    return stored, f"{change}{CHANGED}" if change else ""
 
 
-def write(read: Plain, parts: object, image: bytes) -> None:
-    """Keep a program for this command line, folder and Python.
+def write(read: Plain, image: Image) -> None:
+    """Store an image for this command line, folder and Python.
 
     Raises OSError, also if an input has changed since it was read; then the earlier file remains.
     """
@@ -119,13 +115,13 @@ def write(read: Plain, parts: object, image: bytes) -> None:
         raise PermissionError(errno.EPERM, "the folder belongs to another user", place)
     os.chmod(place, 0o700)
     _remove_unfinished(place)
-    values = marshal.dumps((_identity(), read, parts))  # type: ignore[arg-type]  # which are plain
-    head = _HEAD.pack(_MAGIC, _FORMAT, sys.hexversion, len(values), len(image))
+    values = marshal.dumps((_identity(), read, image.parts()))  # type: ignore[arg-type]  # which are plain
+    head = _HEAD.pack(_MAGIC, _FORMAT, sys.hexversion, len(values))
     unfinished = f"{path}.{os.getpid()}-{time.monotonic_ns()}{_UNFINISHED}"
     descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
         with open(descriptor, "wb") as stream:
-            stream.writelines((head, _CHECKSUM.pack(_crc(head, values, image)), values, image))
+            stream.writelines((head, _CHECKSUM.pack(_crc(head, values)), values))
             stream.flush()
             os.fsync(descriptor)
         os.rename(unfinished, path)
@@ -190,7 +186,7 @@ def _crc(*parts: bytes | bytearray | memoryview) -> int:
     return crc
 
 
-def _read(path: str) -> Kept:
+def _read(path: str) -> Stored:
     """Read a file without mapping it: truncating a mapped file kills the process. Raises OSError or _UnusableError."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -204,28 +200,24 @@ def _read(path: str) -> Kept:
             raise _UnusableError("it is not a regular file")
         _check_owner(status, "it")
         _check_owner(os.stat(os.path.dirname(path)), "its folder")
-        kept = _parsed(descriptor, status)
+        stored = _parsed(descriptor, status)
     finally:
         os.close(descriptor)
-    if _path(kept.identity) != path:
+    if _path(stored.identity) != path:
         raise _UnusableError(_OF_ANOTHER)
-    return kept
+    return stored
 
 
-def _parsed(descriptor: int, status: os.stat_result) -> Kept:
+def _parsed(descriptor: int, status: os.stat_result) -> Stored:
     """Return the content of an open file. Raises _UnusableError."""
     with open(descriptor, "rb", buffering=0, closefd=False) as stream:
         head, checksum = stream.read(_HEAD.size), stream.read(_CHECKSUM.size)
-        values_size, image_size = _sizes(head, status.st_size)
-        values = bytearray(values_size)
-        image = mmap.mmap(-1, max(image_size, 1), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        with memoryview(image) as whole, whole[:image_size] as view:
-            is_whole = stream.readinto(values) == values_size and stream.readinto(view) == image_size
-            is_whole = is_whole and checksum == _CHECKSUM.pack(_crc(head, values, view))
-    if not is_whole:
+        size = _size(head, status.st_size)
+        values = stream.read(size)
+    if len(values) != size or checksum != _CHECKSUM.pack(_crc(head, values)):
         raise _UnusableError("it is damaged")
     identity, read, parts = marshal.loads(values)  # noqa: S302 - this user's Python wrote it
-    return Kept(identity, status.st_mtime, read, parts, image)
+    return Stored(identity, status.st_mtime, read, Image(**parts))
 
 
 def _check_owner(status: os.stat_result, what: str) -> None:
@@ -235,20 +227,20 @@ def _check_owner(status: os.stat_result, what: str) -> None:
         raise _UnusableError(f"others may write to {what}")
 
 
-def _sizes(head: bytes, size: int) -> tuple[int, int]:
-    """Return the sizes of values and image in a file of this size. Raises _UnusableError."""
+def _size(head: bytes, size: int) -> int:
+    """Return the size of the values in a file of this size. Raises _UnusableError."""
     if not head.startswith(_MAGIC[: len(head)]):
         raise _UnusableError("it is not a kept program")
     if len(head) < _HEAD.size:
         raise _UnusableError("it is truncated")
-    _, form, version, values, image = _HEAD.unpack(head)
+    _, form, version, values = _HEAD.unpack(head)
     if form != _FORMAT:
         raise _UnusableError("it has another format")
     if version != sys.hexversion:
         raise _UnusableError("it was written by another version of Python")
-    if size != (whole := _HEAD.size + _CHECKSUM.size + values + image):
+    if size != (whole := _HEAD.size + _CHECKSUM.size + values):
         raise _UnusableError("it is truncated" if size < whole else "it is damaged")
-    return values, image
+    return int(values)
 
 
 def _remove_unfinished(place: str) -> None:

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Collection, Iterator
 from contextlib import closing
-from mmap import mmap
 from pathlib import Path
 
 import pytest
@@ -22,15 +21,14 @@ from router.app import router as whole
 from router.app.plane import Plane
 from router.app.runtime import Runtime
 from router.carrier import events
-from router.carrier.carrier import Carrier
-from router.carrier.image import image_of
+from router.carrier.forwarding_threads import ForwardingThreads
 from router.cli import run
 from router.compiler.program import Program
-from router.kept import head_start as head_starts
-from router.kept.head_start import HeadStart, HeadStartAttempt
-from router.kept.store import Kept
-from router.library import library
+from router.image.image import Image
+from router.image.writer import write_image
 from router.net.sockets import ListeningSocket, open_sending
+from router.startup_image import head_start as head_starts
+from router.startup_image.head_start import HeadStart, HeadStartAttempt
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, site
 from tests.app.test_runtime import NAN_PH, PH
@@ -48,10 +46,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def head_start(program: Program) -> HeadStart:
-    parts, image = image_of(library(), program)
-    memory = mmap(-1, len(image))
-    memory[:] = image
-    return HeadStart(Kept(((), "", ""), 0.0, (), marshal.loads(marshal.dumps(parts)), memory))  # noqa: S302 - written here
+    parts = marshal.loads(marshal.dumps(write_image(program).parts()))  # noqa: S302 - written here
+    return HeadStart(Image(**parts), ())
 
 
 @pytest.fixture(autouse=True)
@@ -129,7 +125,7 @@ def test_a_head_start_whose_threads_cannot_start_is_undone(site: Site, monkeypat
     def fail(*_: object) -> None:
         raise OSError("no threads")
 
-    monkeypatch.setattr(Carrier, "start", fail)
+    monkeypatch.setattr(ForwardingThreads, "start", fail)
     with pytest.raises(OSError, match="no threads"):
         head_start(site.program(DRIVING.replace("20ms", "1h")))
     assert site.basestation.recv(1000) == BRAKE
@@ -154,7 +150,7 @@ def test_what_fails_before_the_verb_runs_leaves_the_board_halted(site: Site, mon
 def test_sockets_of_a_head_start_are_no_standard_streams() -> None:
     script = """\
 import os, sys
-from router.kept import head_start
+from router.startup_image import head_start
 def begin():
     os.write(1, os.readlink("/proc/self/fd/2").encode())
     raise KeyboardInterrupt
@@ -182,7 +178,7 @@ def test_a_socket_that_a_head_start_sends_by_is_closed_once_no_thread_uses_it(
 
     monkeypatch.setattr(head_starts, "open_sending", open_elsewhere)
     started = head_start(program)
-    left, was_open = started.senders["basestation"].socket, []
+    left, was_open = started.senders["basestation"][1].socket, []
 
     class Observed(Plane):
         def wait_until_adopted(self) -> bool:
@@ -204,8 +200,9 @@ def test_topics_of_a_head_start_are_bound_once(site: Site, monkeypatch: pytest.M
       - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
 """
     program = site.program(topic)
-    started, bound = head_start(program), []
-    monkeypatch.setattr(started, "bind_topic", lambda *arguments: bound.append(arguments))
+    started = head_start(program)
+    bound: list[object] = []
+    monkeypatch.setattr(started.image, "bind_topics", bound.append)
     with Router(program, head_start=started) as router:
         site.write(topic.replace("queue_depth: 10", "queue_depth: 11"))
         assert router.reload().ok

@@ -10,7 +10,7 @@ from router.carrier.ring import Ring
 from router.carrier.threads import NativeThread
 
 
-class Carrier(NativeThread):
+class ForwardingThreads(NativeThread):
     """Receives datagrams and executes programs, in native threads that never wait for Python.
 
     `counts` is the array of the receive thread, which writes losses and rejections to `events`, and messages for topics

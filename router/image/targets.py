@@ -1,0 +1,178 @@
+"""The targets of routes as the carrier executes them: `struct targets` of `native/deliver.h`."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from router import declared as c
+from router.compiler.lowering import LoweredCollect, LoweredRoute, LoweredTarget
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines, native_values
+from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
+from router.image.openings import Openings, period
+from router.table.model import OnLimit
+
+Sources = Mapping[int, "str | None"]
+"""The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
+
+_DROP_REASONS = [loss.name.lower() for loss in c.Loss]
+
+
+@dataclass(frozen=True, slots=True)
+class Timer:
+    """A timer to adopt, by its symbol, and the addresses of the targets or of the one target that it delivers to."""
+
+    symbol: int
+    is_topic: bool = False
+    targets: int | None = None
+    target: int | None = None
+
+
+@dataclass(slots=True)
+class TargetWriter:
+    """Writes the targets of a table to `arrays`. `timers` are those of deferrals and collectors."""
+
+    program: Program
+    openings: Openings
+    arrays: Arrays
+    boards: Mapping[str, ctypes._Pointer[c.Board]]
+    timers: list[Timer] = field(default_factory=list)
+    _topics: dict[str, c.Topic] = field(default_factory=dict)
+    _sources: Any = None
+
+    def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
+        """Write the targets that get datagrams; `lowered` are the routines of targets that have some."""
+        if lowered is None:
+            return self.targets(plan, targets, {}, None)
+        routines = Routines(lowered.layout, self.arrays)
+        written = self.targets(plan, targets, lowered.targets, routines)
+        if lowered.collect is not None:
+            collect = write_collect(lowered.collect, routines, self._numbers_of_senders())
+            collect.collector = self.openings.collector(plan)
+            written.collect = ctypes.pointer(self.arrays.add(collect))
+            self.timers.append(Timer(collect.collector, True, ctypes.addressof(written)))
+        written.layout, written.sources = routines.layout(), self.names_of_senders()
+        return written
+
+    def targets(
+        self,
+        plan: RoutePlan,
+        targets: Sequence[TargetPlan],
+        lowered: Mapping[str, LoweredTarget],
+        routines: Routines | None,
+    ) -> c.Targets:
+        """Write the targets, without their layout."""
+        array = self.arrays.array(c.Target, [self._target(plan, each, lowered, routines) for each in targets])
+        number = self.openings.names.number
+        together = c.Targets(
+            ttl=plan.ttl or 0,
+            targets=array,
+            count=len(targets),
+            route=number(plan.route),
+            topic=c.NO_NAME if plan.topic is None else number(plan.topic),
+        )
+        sources = self._sources_of(plan)
+        for written, target in zip(array or (), targets, strict=True):
+            if target.is_deferred:
+                deferrals = {at: self.openings.deferral(plan, target, source) for at, source in sources.items()}
+                written.deferrals = self._by_source(deferrals)
+                to = ctypes.addressof(together), ctypes.addressof(written)
+                self.timers += [Timer(each, target.is_topic, *to) for each in deferrals.values()]
+            if target.max_rate is not None and not written.period:
+                limits = {at: self.openings.limit(plan, target, source) for at, source in sources.items()}
+                written.limits = self._by_source(limits)
+            if target.deadmen:
+                feeds = [self._feed(plan, target, route) for route in target.deadmen]
+                written.feeds, written.feed_count = self.arrays.array(c.Feed, feeds), len(feeds)
+        return self.arrays.add(together)
+
+    def _target(
+        self, plan: RoutePlan, target: TargetPlan, lowered: Mapping[str, LoweredTarget], routines: Routines | None
+    ) -> c.Target:
+        counters, place = self.program.counters, (plan.route, target.label)
+        written = self._topic(target.label) if target.is_topic else self._destination(target.label)
+        if routines is not None and target.label in lowered:
+            written.condition = routines.routine(lowered[target.label].condition)
+            written.message = routines.routine(lowered[target.label].message)
+        written.id = self.openings.names.number(target.label)
+        written.waiting = counters.index("messages_waiting", *place)
+        written.filtered = counters.index("messages_filtered", *place)
+        if target.is_topic and plan.collect_timeout is not None:
+            written.collected = counters.index("messages_collected", *place)
+        written.delivered = counters.index("messages_published" if target.is_topic else "datagrams_sent", *place)
+        written.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in _DROP_REASONS]
+        if not target.is_topic:
+            written.delivered_bytes = counters.index("sent_bytes", *place)
+        written.period, written.priority = _held_period(target), c.Priority[target.priority.name]
+        return written
+
+    def _destination(self, endpoint: str) -> c.Target:
+        written = c.Target(
+            sender=self.openings.sender(endpoint), trims=self.program.table.endpoints[endpoint].trim_trailing_zeros
+        )
+        if endpoint in self.boards:
+            written.board = self.boards[endpoint]
+        return written
+
+    def _topic(self, topic: str) -> c.Target:
+        if topic not in self._topics:
+            address = self.openings.symbols.address
+            written = c.Topic(publisher=address("publisher", topic), wanted=address("wanted", topic))
+            self._topics[topic] = self.arrays.add(written)
+        return c.Target(topic=ctypes.pointer(self._topics[topic]))
+
+    def _feed(self, plan: RoutePlan, target: TargetPlan, route: str) -> c.Feed:
+        """Return the effect of the target's commands on the deadman of a route: its own, or one that they disarm."""
+        feed = self.openings.feed(route, target.label, disarms=route != plan.route)
+        held = self.openings.holding(route, target.label) if feed.disarms else []
+        if held:
+            feed.superseded = self.arrays.add((ctypes.c_void_p * len(held))(*held))
+            feed.superseded_count = len(held)
+        return feed
+
+    def _by_source(self, symbols: Mapping[int, int]) -> Any:
+        array = self.arrays.add((ctypes.c_void_p * (max(symbols) + 1))())
+        for at, symbol in symbols.items():
+            array[at] = symbol
+        return array
+
+    def _sources_of(self, plan: RoutePlan) -> Sources:
+        if plan.topic is not None:
+            return {0: None}
+        senders = (*self.program.table.endpoints, STRANGER)
+        return {column: sender for column, sender in enumerate(senders) if sender in plan.sources}
+
+    def _numbers_of_senders(self) -> list[int]:
+        """Return the numbers of the senders' names, by column."""
+        return [self.openings.names.number(label) for label in self._labels_of_senders()]
+
+    def _labels_of_senders(self) -> list[str]:
+        return [*self.program.table.endpoints, source_label(STRANGER)]
+
+    def names_of_senders(self) -> Any:
+        """Return values with the senders' names, by column."""
+        if self._sources is None:
+            self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
+        return self._sources
+
+
+def write_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:
+    """Write `collect`, without a collector. `senders` are numbers of names by column, `routines` the route's."""
+    return c.Collect(
+        by=routines.routine(lowered.by),
+        count=routines.routine(lowered.count),
+        order=routines.routine(lowered.order),
+        senders=routines.arrays.array(ctypes.c_uint32, senders),
+        is_text=lowered.is_text,
+        signs=lowered.signs,
+        items=lowered.items,
+        counted=lowered.counted,
+    )
+
+
+def _held_period(target: TargetPlan) -> int:
+    """Return the time between two messages of a target with `on_limit: latest`, in ns; otherwise 0."""
+    return period(target.max_rate) if target.max_rate is not None and target.on_limit is OnLimit.LATEST else 0

@@ -1,0 +1,278 @@
+"""Writes the image of a compiled table.
+
+The compiler has decided everything; here names become indexes, and structures become memory.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from router import declared as c
+from router.compiler.lowering import LoweredElements, LoweredFeed
+from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.routines import Routines
+from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
+from router.compiler.network import recognisers, sent_from
+from router.compiler.program import STRANGER, DeadmanPlan, Program, RoutePlan, source_label
+from router.declared import NONE
+from router.image.boards import write_boards
+from router.image.image import Image
+from router.image.memory import Memory, Symbols, address_in
+from router.image.names import Names
+from router.image.openings import Openings
+from router.image.targets import TargetWriter, Timer
+from router.image.wire_schema import write_schema
+from router.table.model import Endpoint, EndpointKind, Framing
+
+_REJECT_REASONS = [reason.name.lower() for reason in c.Reason]
+
+
+def write_image(program: Program, names: Names | None = None) -> Image:
+    """Write the image of a table. It adds to `names`, the names of the process. Equal tables have equal images."""
+    names, arrays = names or Names(), Arrays()
+    openings = Openings(program, names)
+    for deadman in program.deadmen:
+        openings.deadman(deadman)
+    pacers = [Timer(each) for each in openings.pacers()]
+    targets = TargetWriter(program, openings, arrays, write_boards(program.boards, arrays))
+    plans = [plan for several in program.inbound.values() for plan in several]
+    numbers = {plan.route: number for number, plan in enumerate(plans)}
+    columns = {name: column for column, name in enumerate(program.table.endpoints)}
+    structure = arrays.add(_Writer(program, targets, numbers, columns).program_of(plans))
+    ros = {topic: _ros_routes(targets, topic, feeds) for topic, feeds in program.lowered.from_ros.items()}
+    for client_deadman in program.client_deadmen:
+        openings.client_deadman(client_deadman)
+    memory = Memory(arrays)
+    relocatable = memory.relocatable()
+    return Image(
+        **relocatable._asdict(),
+        symbols=openings.symbols.all,
+        program=memory.offset(ctypes.addressof(structure)),
+        listener_array=memory.offset(address_in(structure, "listeners")) if program.listeners else 0,
+        ros_topics=[
+            (topic, memory.offset(ctypes.addressof(routes)), len(routes), any(feed.is_urgent for feed in feeds))
+            for (topic, feeds), routes in zip(program.lowered.from_ros.items(), ros.values(), strict=True)
+        ],
+        listeners=[
+            (each.name, tuple(each.address.value), each.interface, each.receive_buffer) for each in program.listeners
+        ],
+        senders=[
+            (each.name, tuple(each.address.value), each.kind is EndpointKind.BOARD, sent_from(program.table, each))
+            for each in program.senders
+        ],
+        topics=[(each.label, each.qos.serves_late_joiners) for each in program.publishers],
+        openings=[*openings.listed.values()],
+        timers=[_timer(each, memory) for each in (*pacers, *targets.timers)],
+        deadmen=[_deadman(plan) for plan in program.deadmen],
+        client_deadmen=[_deadman(plan) for plan in program.client_deadmen],
+        names=names.all(),
+        series=program.counters.indexes(),
+        counters=program.counters.size,
+        mirror_lost=program.counters.index("mirror_dropped") if program.table.record is not None else None,
+    )
+
+
+def _timer(timer: Timer, memory: Memory) -> tuple[int, bool, int | None, int | None]:
+    targets, target = (None if each is None else memory.offset(each) for each in (timer.targets, timer.target))
+    return Symbols.number(timer.symbol), timer.is_topic, targets, target
+
+
+def _deadman(plan: DeadmanPlan) -> tuple[str, list[str], list[tuple[str, str]]]:
+    return plan.route, [name for name, _ in plan.datagrams], sorted(plan.watched)
+
+
+def _pause(endpoint: Endpoint) -> int:
+    """Return the longest pause (ns) between two datagrams that is no silence.
+
+    `stale_after` is the time after which silence is a problem. By default it is 5 s, and a board that is reset takes
+    about 2 s: so 2/5 of it. An endpoint that is never stale has no silences.
+    """
+    return c.NEVER if endpoint.stale_after is None else endpoint.stale_after * 2 // 5
+
+
+@dataclass(frozen=True, slots=True)
+class _Writer:
+    """Writes what the receive thread executes: listeners, payload cases, and routes from UDP."""
+
+    program: Program
+    targets: TargetWriter
+    numbers: Mapping[str, int]
+    """Numbers of the routes."""
+    columns: Mapping[str, int]
+    """Columns of the endpoints; unknown senders have the column after the last one."""
+
+    @property
+    def counters(self) -> Counters:
+        return self.program.counters
+
+    @property
+    def arrays(self) -> Arrays:
+        return self.targets.arrays
+
+    def program_of(self, plans: list[RoutePlan]) -> c.Program:
+        program = self.program
+        return c.Program(
+            listener_count=len(program.listeners),
+            case_count=len(program.envelope.numbers),
+            unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
+            schema=ctypes.pointer(write_schema(program.envelope, program.inbound.keys(), self.arrays)),
+            listeners=self.arrays.array(c.Listener, [self._listener(*each) for each in self._framings()]),
+            cases=self.arrays.array(c.PayloadCase, self._cases()),
+            routes=self.arrays.array(c.Route, [self._route(plan) for plan in plans]),
+        )
+
+    # senders and payload cases
+
+    def _cases(self) -> list[c.PayloadCase]:
+        members = sorted((number, name) for name, number in self.program.envelope.numbers.items())
+        rows = {number: row for row, number in enumerate(self.program.inbound)}
+        return [
+            c.PayloadCase(
+                number=number,
+                row=rows.get(number, -1),
+                is_ignored=number in self.program.ignored,
+                unhandled=self.counters.index("unhandled", name),
+            )
+            for number, name in members
+        ]
+
+    def _framings(self) -> Iterator[tuple[str, Framing]]:
+        yield from ((plan.name, plan.framing) for plan in self.program.listeners)
+
+    def _listener(self, name: str, framing: Framing) -> c.Listener:
+        """Write a listener, without its socket."""
+        counters, peers = self.counters, list(self._peers(name))
+        return c.Listener(
+            fd=-1,
+            id=self.targets.openings.names.number(name),
+            repairs=framing is Framing.ZERO_TRIMMED,
+            peers=self.arrays.array(c.Peer, peers),
+            choices=self.arrays.array(c.Choice, list(self._choices())),
+            peer_count=len(peers),
+            columns=len(self.columns) + 1,
+            received=counters.index("datagrams_received", name),
+            received_bytes=counters.index("received_bytes", name),
+            padded=counters.index("datagrams_padded", name),
+            superseded=counters.index("superseded_members", name),
+            rejected=tuple(counters.index("datagrams_rejected", name, reason) for reason in _REJECT_REASONS),
+        )
+
+    def _peers(self, listener: str) -> Iterator[c.Peer]:
+        """Yield the peers by address; those with a port come first, as they have priority."""
+        by_host, by_address = recognisers(self.program.table.endpoints, listener)
+        known = [(host, port, name) for (host, port), name in by_address.items()]
+        known += [(host, 0, name) for host, name in by_host.items()]
+        for address, _, port, name in sorted((_number(host), not port, port, name) for host, port, name in known):
+            last_seen, heard_since, silences, last_silence = (
+                self.counters.index(metric, name) for metric in ENDPOINT_METRICS
+            )
+            yield c.Peer(
+                address=address,
+                port=port,
+                column=self.columns[name],
+                last_seen=last_seen,
+                heard_since=heard_since,
+                silences=silences,
+                last_silence=last_silence,
+                id=self.targets.openings.names.number(name),
+                pause=_pause(self.program.table.endpoints[name]),
+            )
+
+    def _choices(self) -> Iterator[c.Choice]:
+        """Yield the choices by row, as in `_cases`: a column for each endpoint, and a last one for unknown senders."""
+        for plans in self.program.inbound.values():
+            by_source = {source: plan for plan in plans for source in plan.sources}
+            stranger = self._choice(by_source.get(STRANGER), STRANGER)
+            for name in self.columns:
+                plan = by_source.get(name)
+                yield self._choice(plan, name) if plan else stranger
+            yield stranger
+
+    def _choice(self, plan: RoutePlan | None, source: str | None) -> c.Choice:
+        if plan is None:
+            return c.Choice(route=-1)
+        received = self.counters.index("messages_received", plan.route, source_label(source))
+        return c.Choice(route=self.numbers[plan.route], received=received)
+
+    # routes
+
+    def _route(self, plan: RoutePlan) -> c.Route:
+        lowered, of_datagrams = self.program.lowered, self.targets.of_datagrams
+        topics = [target for target in plan.targets if target.is_topic]
+        destinations = [target for target in plan.targets if not target.is_topic]
+        route = c.Route(
+            sends=of_datagrams(plan, destinations, lowered.to_destinations.get(plan.route)),
+            last_message=self.counters.index("route_silence_seconds", plan.route),
+            duration=self.counters.index("route_duration_seconds", plan.route),
+        )
+        if topics:
+            route.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
+        witnesses = [*self._witnesses(plan)]
+        route.witnesses, route.witness_count = self.arrays.array(c.Witness, witnesses), len(witnesses)
+        return route
+
+    def _witnesses(self, plan: RoutePlan) -> Iterator[c.Witness]:
+        """Yield a witness for each deadman that awaits messages of this route, and each endpoint that sends them."""
+        for deadman in self.program.deadmen:
+            if deadman.obeyed is not None and deadman.obeyed.case == plan.case.name:
+                yield from (self._witness(deadman, name) for name in deadman.obeyed.endpoints if name in plan.sources)
+
+    def _witness(self, deadman: DeadmanPlan, endpoint: str) -> c.Witness:
+        lowered, openings = self.program.lowered.obeyed[deadman.route], self.targets.openings
+        routines = Routines(lowered.layout, self.arrays)
+        return c.Witness(
+            deadman=openings.deadman(deadman),
+            condition=routines.routine(lowered.routine),
+            layout=routines.layout(),
+            sources=self.targets.names_of_senders(),
+            column=self.columns[endpoint],
+            deadman_id=openings.names.number(deadman.route),
+            endpoint_id=openings.names.number(endpoint),
+        )
+
+
+def _number(host: str) -> int:
+    return int.from_bytes(bytes(map(int, host.split("."))), "big")
+
+
+def _ros_routes(writer: TargetWriter, topic: str, feeds: tuple[LoweredFeed, ...]) -> ctypes.Array[c.RosRoute]:
+    """Write the routes of a topic from ROS: an array of `struct ros_route` of `native/route_ros.h`."""
+    plans = {plan.route: plan for plan in writer.program.outbound[topic]}
+    array: ctypes.Array[c.RosRoute] = writer.arrays.array(
+        c.RosRoute, [_ros_route(writer, plans[feed.route], feed) for feed in feeds]
+    )
+    return array
+
+
+def _ros_route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
+    assert plan.topic is not None  # noqa: S101 - a route from ROS has a topic
+    counters, routines = writer.program.counters, Routines(feed.layout, writer.arrays)
+    targets = writer.targets(plan, plan.targets, feed.targets, routines)
+    for_each = write_for_each(feed.for_each, routines)
+    targets.layout = routines.layout()
+    seconds, nanoseconds = feed.stamp or (NONE, NONE)
+    return c.RosRoute(
+        targets=targets,
+        for_each=for_each,
+        seconds=seconds,
+        nanoseconds=nanoseconds,
+        received=counters.index("messages_received", plan.route, plan.topic),
+        last_message=counters.index("route_silence_seconds", plan.route),
+        duration=counters.index("route_duration_seconds", plan.route),
+    )
+
+
+def write_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
+    """Write the `for_each` of a route; empty if it has none."""
+    if elements is None:
+        return c.ForEach()
+    return c.ForEach(
+        list=routines.routine(elements.routine),
+        stored=elements.scalar,
+        section=elements.section,
+        item=elements.item,
+        index=elements.index,
+        count=elements.count,
+    )

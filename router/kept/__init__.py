@@ -1,1 +1,0 @@
-"""Kept programs: the compiled program of the last start, in a file, and the head start from it."""
