@@ -6,7 +6,7 @@ import pytest
 
 from router.datagrams import Wire, framed, why_rejected, wire_of_protos
 from router.errors import DecodeError, UsageError
-from router.values import payload
+from router.values.reading import payload
 from tests.everything import unroutable, usual
 from tests.everything import wire as wire_of_everything
 

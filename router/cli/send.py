@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from router.datagrams import framed
     from router.tools import udp
     from router.tools.udp import Sent, send
-    from router.values import payload
+    from router.values.reading import payload
 
     wire, table = load_wire(args, args.to)
     case = wire.case(args.case)

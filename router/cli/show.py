@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 def _say_what(recording: Recording, first: Entry) -> None:
     from router.recording.about import tripped_in
     from router.tools.tap import local_time
-    from router.values import time_text
+    from router.values.printing import time_text
 
     begin = local_time(first.at)
     tripped = ", ".join(tripped_in(recording.about))
@@ -94,7 +94,7 @@ def _window(args: argparse.Namespace, first: Entry) -> tuple[int, int] | None:
 
 def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
     from router.tools.tap import local_time
-    from router.values import time_text
+    from router.values.printing import time_text
 
     begin, end, last_shown = (time_text(local_time(each)) for each in (*span, last))
     say(f"{what} between {begin} and {end}; the recording ends at {last_shown}")

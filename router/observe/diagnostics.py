@@ -21,7 +21,7 @@ from router.observe.snapshot import Labels
 from router.observe.watch import Health
 from router.table.model import Endpoint, Route
 from router.threads import Thread, background_threads, join_or_abandon
-from router.values import age_text
+from router.values.printing import age_text
 
 
 class Level(enum.IntEnum):

@@ -34,7 +34,7 @@ from router.observe.problems import DROPS, Kind, Problem
 from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.table.model import ANY, EndpointKind
-from router.values import age_text
+from router.values.printing import age_text
 
 if TYPE_CHECKING:
     from router.compiler.program import Program

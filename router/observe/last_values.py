@@ -15,7 +15,7 @@ from router.compiler.program import Program
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, payload_number
 from router.threads import Thread
-from router.values import protobuf_json
+from router.values.printing import protobuf_json
 
 LOOKED_AT_SECONDS = 5.0
 """How long the mirror stays attached after a request; a page sends one every second."""

@@ -13,7 +13,7 @@ from router.compiler.program import Program
 from router.datagrams import Wire
 from router.errors import DecodeError, listed
 from router.log import logger
-from router.values import protobuf_tree, words
+from router.values.printing import protobuf_tree, words
 
 MOST_FIELDS = 4
 """Maximum number of fields of a message that a text names."""

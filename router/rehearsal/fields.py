@@ -16,14 +16,15 @@ from google.protobuf.message import Message
 
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import STAMP_TYPES
-from router.errors import Code, SourceSpan, UsageError, did_you_mean
+from router.errors import Code, SourceSpan, UsageError
 from router.rehearsal.rehearsal import START
 from router.table.compose import resolve
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
-from router.values import elements, parse, scalar_text, zero
+from router.values.printing import elements, scalar_text
+from router.values.reading import filled, member, parse, zero
 
 ANY = "any"
 RECEIVED_AT = "received_at"
@@ -131,10 +132,6 @@ class Elements:
 FieldValue = Union[AnyValue, Scalar, Time, Fields, Elements]
 
 
-def invalid(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
-    return InvalidValueError(span, code, message, hint)
-
-
 # Reading them
 
 
@@ -155,7 +152,8 @@ class FieldReader:
 
     def message(self, kind: MessageType, node: Node) -> Fields:
         if not isinstance(node, MappingNode):
-            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
+            message = f"{kind} is a message: write its fields, {{name: value}}"
+            raise InvalidValueError(node.span, Code.WRONG_TYPE, message)
         members: dict[str, FieldValue] = {}
         for path, entry in node.entries.items():
             self._put(members, kind, path, entry)
@@ -165,19 +163,18 @@ class FieldReader:
         """Add the value of a path such as `header.stamp` to the members of a message."""
         span = entry.key.span
         name, dot, rest = path.partition(".")
-        field = kind.field(name)
-        if field is None:
-            hint = did_you_mean(name, [member.name for member in kind.fields])
-            if kind.field(name.partition("[")[0]):
-                hint = "write a list as a whole: [a, b]"
-            raise invalid(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
+        try:
+            field = member(kind, name)
+        except UsageError as error:
+            hint = "write a list as a whole: [a, b]" if kind.field(name.partition("[")[0]) else error.hint
+            raise InvalidValueError(span, Code.UNKNOWN_FIELD, error.what, hint) from error
         if dot and not isinstance(field.type, MessageType):
             is_list = isinstance(field.type, List) and isinstance(field.type.element, MessageType)
             hint = f"write its elements: {name}: [{{{rest}: VALUE}}]" if is_list else ""
-            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields", hint)
+            raise InvalidValueError(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields", hint)
         inner = members.get(name)
         if inner is not None and not (dot and isinstance(inner, Fields)):
-            raise invalid(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+            raise InvalidValueError(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
         if dot and isinstance(field.type, MessageType):
             below = dict(inner.members) if isinstance(inner, Fields) else {}
             self._put(below, field.type, rest, entry)
@@ -200,18 +197,18 @@ class FieldReader:
             case _, ScalarNode():
                 return self._scalar(kind, node, holder)
         hint = "write the text itself" if is_text(node) else ""
-        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value", hint)
+        raise InvalidValueError(node.span, Code.WRONG_TYPE, f"a {kind} takes one value", hint)
 
     def _list(self, kind: List, node: Node, holder: MessageType) -> Elements:
         if isinstance(node, SequenceNode):
             if kind.length is not None and len(node.items) != kind.length:
                 message = f"{kind} has {kind.length} elements, not {len(node.items)}"
-                raise invalid(node.span, Code.TYPE_MISMATCH, message)
+                raise InvalidValueError(node.span, Code.TYPE_MISMATCH, message)
             return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
         if kind.entry is None:
-            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a list: write [a, b]")
+            raise InvalidValueError(node.span, Code.WRONG_TYPE, f"{kind} is a list: write [a, b]")
         if not isinstance(node, MappingNode):
-            raise invalid(node.span, Code.WRONG_TYPE, "this is a map: write {key: value}")
+            raise InvalidValueError(node.span, Code.WRONG_TYPE, "this is a map: write {key: value}")
         return self._entries(kind.entry, node)
 
     def _entries(self, kind: MessageType, node: MappingNode) -> Elements:
@@ -235,9 +232,9 @@ class FieldReader:
         if isinstance(kind, Bytes):
             text = text.replace(" ", "")
         try:
-            return Scalar(parse(kind, text, ""), node.span)
+            return Scalar(parse(kind, text), node.span)
         except UsageError as error:
-            raise invalid(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
+            raise InvalidValueError(node.span, Code.BAD_VALUE, str(error)) from error
 
     def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
         """Return the value of a ROS constant of the message (`STATUS_FIX`), or of an enum (`GPSFixQuality.RTK_FIX`)."""
@@ -247,7 +244,7 @@ class FieldReader:
         numbers = self._constants.get(text, set())
         if len(numbers) > 1:
             message = f"several enums have a value '{text}', with different numbers"
-            raise invalid(span, Code.BAD_VALUE, message, f"name the enum, as in State.{text}")
+            raise InvalidValueError(span, Code.BAD_VALUE, message, f"name the enum, as in State.{text}")
         return next(iter(numbers), None)
 
 
@@ -255,10 +252,10 @@ def _refuse_other_type(kind: Type, node: ScalarNode) -> None:
     """Raise InvalidValueError for a quoted number or truth value, and for a number in place of a truth value."""
     if isinstance(kind, (Bool, Int, Float)) and isinstance(node.value, str) and not isinstance(resolve(node.text), str):
         hint = f"write it without quotes: {node.text}"
-        raise invalid(node.span, Code.WRONG_TYPE, f"the text '{node.text}' is not a {kind}", hint)
+        raise InvalidValueError(node.span, Code.WRONG_TYPE, f"the text '{node.text}' is not a {kind}", hint)
     if isinstance(kind, Bool) and not isinstance(node.value, bool):
         hint = {"0": "write false", "1": "write true"}.get(node.text, "write true or false")
-        raise invalid(node.span, Code.WRONG_TYPE, f"'{node.text}' is not a bool", hint)
+        raise InvalidValueError(node.span, Code.WRONG_TYPE, f"'{node.text}' is not a bool", hint)
 
 
 def _near(text: str, span: SourceSpan) -> Scalar | None:
@@ -271,7 +268,7 @@ def _near(text: str, span: SourceSpan) -> Scalar | None:
         value = _finite(found[1], "number to be near", span)
         tolerance = _finite(found[2], "tolerance", span)
         if tolerance < 0:
-            raise invalid(span, Code.BAD_VALUE, f"the tolerance '{found[2]}' is negative")
+            raise InvalidValueError(span, Code.BAD_VALUE, f"the tolerance '{found[2]}' is negative")
         return Scalar(value, span, tolerance, text)
     return None
 
@@ -282,7 +279,7 @@ def _finite(text: str, what: str, span: SourceSpan) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise invalid(span, Code.BAD_VALUE, f"'{text}' is not a {what}", "write a number, as in 1.57 +- 0.01")
+        raise InvalidValueError(span, Code.BAD_VALUE, f"'{text}' is not a {what}", "write a number, as in 1.57 +- 0.01")
     return value
 
 
@@ -295,7 +292,7 @@ def _offset(node: ScalarNode) -> int | None:
         return parse_duration(node.text)
     except ValueError as error:
         hint = f"write '{RECEIVED_AT}', or the time after the beginning of the test, for example 300ms"
-        raise invalid(node.span, Code.BAD_VALUE, str(error), hint) from error
+        raise InvalidValueError(node.span, Code.BAD_VALUE, str(error), hint) from error
 
 
 # Messages from what a test gives
@@ -303,7 +300,7 @@ def _offset(node: ScalarNode) -> int | None:
 
 def protobuf_message(message_class: type[Message], given: Fields, now: int) -> Message:
     """Return a protobuf message with these fields set; `now` is when it arrives, ns."""
-    return message_class(**_plain(given, now, complete=False))
+    return filled(message_class(), _plain(given, now, complete=False))
 
 
 def ros_values(given: Fields, now: int) -> Mapping[str, Any]:
@@ -313,7 +310,7 @@ def ros_values(given: Fields, now: int) -> Mapping[str, Any]:
 
 
 def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
-    """Return a given value as protobuf's constructors accept it, with messages and maps as dicts.
+    """Return a given value as `filled` takes it, with messages and maps as dicts.
 
     `complete`: including the defaults of fields that are not given.
     """

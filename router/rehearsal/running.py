@@ -10,7 +10,7 @@ from router.errors import Code, Diagnostic, UsageError
 from router.rehearsal import cdr
 from router.rehearsal.comparing import Comparison, Failure, Outcome
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.fields import invalid, protobuf_message, ros_values
+from router.rehearsal.fields import protobuf_message, ros_values
 from router.rehearsal.reading import TableTest, TestFile
 from router.rehearsal.rehearsal import START, Rehearsal
 from router.rehearsal.steps import Given, Step
@@ -109,7 +109,7 @@ def _datagram(given: Given, wire: Wire, now: int) -> bytes:
             data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
         return framed(data, given.trim, given.pad)
     except UsageError as error:
-        raise invalid(given.span, Code.BAD_VALUE, str(error)) from error
+        raise InvalidValueError(given.span, Code.BAD_VALUE, str(error)) from error
 
 
 def _message(given: Given, now: int) -> bytes:

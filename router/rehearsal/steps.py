@@ -15,10 +15,10 @@ from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
-from router.rehearsal.fields import ANY, FieldReader, Fields, invalid
+from router.rehearsal.fields import ANY, FieldReader, Fields
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
-from router.table.reading import boolean, integer, optional_text, parsed
+from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
 from router.types.model import Enum, MessageType
 from router.types.protobuf import PayloadCase
@@ -136,7 +136,7 @@ class Names:
         envelope = self._program.envelope
         if name not in envelope.cases:
             message = f"{envelope.name} has no payload case '{name}'"
-            raise invalid(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
+            raise InvalidValueError(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
         return envelope.cases[name]
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
@@ -149,7 +149,9 @@ class Names:
             return parse_address(f"{'127.0.0.1' if host == 'localhost' else host}:{port if colon else _PORT}")
         except BadAddressError as error:
             message = f"'{name}' is neither HOST[:PORT] nor a name of the route table"
-            raise invalid(span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)) from error
+            raise InvalidValueError(
+                span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)
+            ) from error
 
     def listener(self, named: Located[str] | None, sender: str, span: SourceSpan) -> str:
         """Return the listener that is named, else the one at which the sender is accepted, else the only one."""
@@ -160,7 +162,7 @@ class Names:
         if endpoint is not None and endpoint.listener is not None:
             return endpoint.listener.value
         if len(listeners) > 1:
-            raise invalid(span, Code.MISSING_KEY, f"name the listener: {', '.join(listeners)}")
+            raise InvalidValueError(span, Code.MISSING_KEY, f"name the listener: {', '.join(listeners)}")
         return next(iter(listeners))
 
     def endpoint(self, name: str, span: SourceSpan) -> str:
@@ -203,7 +205,9 @@ class Names:
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)
         if name not in known:
-            raise invalid(span, code, f"{self._table.path.name} has no {what} '{name}'", did_you_mean(name, known))
+            raise InvalidValueError(
+                span, code, f"{self._table.path.name} has no {what} '{name}'", did_you_mean(name, known)
+            )
         return name
 
 
@@ -230,13 +234,13 @@ class GivenReader:
         _refuse(node, ("message",), "a datagram", _KEYS_OF_DATAGRAMS)
         sender = optional_text(node, "from")
         if sender is None:
-            raise invalid(span, Code.MISSING_KEY, "this datagram has no sender", "add 'from: ENDPOINT'")
+            raise InvalidValueError(span, Code.MISSING_KEY, "this datagram has no sender", "add 'from: ENDPOINT'")
         named, data = optional_text(node, "case"), _hex(node)
         if (named is None) == (data is None):
             message = "write a datagram as 'case' with 'fields' or as 'hex', a ROS message with 'topic'"
-            raise invalid(span, Code.BAD_VALUE, message)
+            raise InvalidValueError(span, Code.BAD_VALUE, message)
         if named is None and (fields := node.entries.get("fields")):
-            raise invalid(fields.key.span, Code.UNKNOWN_KEY, "'fields' needs 'case'")
+            raise InvalidValueError(fields.key.span, Code.UNKNOWN_KEY, "'fields' needs 'case'")
         case = self._names.case(named.value, named.span) if named else None
         pad = integer(node, "pad")
         times, every, age = _repetition(node)
@@ -259,7 +263,7 @@ class GivenReader:
         kind = self._names.subscribed(topic.value, topic.span)
         data, message = _hex(node), node.get("message")
         if data is not None and message is not None:
-            raise invalid(span, Code.BAD_VALUE, "a ROS message has 'message' or 'hex', not both")
+            raise InvalidValueError(span, Code.BAD_VALUE, "a ROS message has 'message' or 'hex', not both")
         fields = self._content(kind, message, topic.span) if data is None else None
         times, every, age = _repetition(node)
         return Given(span, topic.value, fields=fields, data=data, times=times, every=every, age=age)
@@ -272,14 +276,16 @@ def _refuse(node: MappingNode, names: tuple[str, ...], what: str, known: tuple[s
     for name in names:
         if entry := node.entries.get(name):
             hint = f"its keys are {', '.join((*known, 'hex'))}"
-            raise invalid(entry.key.span, Code.UNKNOWN_KEY, f"{what} has no key '{name}'", hint)
+            raise InvalidValueError(entry.key.span, Code.UNKNOWN_KEY, f"{what} has no key '{name}'", hint)
 
 
 def _repetition(node: MappingNode) -> tuple[int, int, int]:
     """Return `times`, `every` and `age`, the latter two in ns."""
     times, every, age = integer(node, "times"), optional_text(node, "every"), optional_text(node, "age")
     if every is not None and times is None:
-        raise invalid(every.span, Code.MISSING_KEY, "'every' without 'times'", "add 'times', the number of messages")
+        raise InvalidValueError(
+            every.span, Code.MISSING_KEY, "'every' without 'times'", "add 'times', the number of messages"
+        )
     return (
         times.value if times else 1,
         parsed(parse_duration, every) if every else 0,
@@ -338,7 +344,7 @@ class ExpectedReader:
         if isinstance(node, ScalarNode):
             return [_of_word(node, given)]
         if not isinstance(node, MappingNode):
-            raise invalid(node.span, Code.WRONG_TYPE, "a list within a list is not a datagram")
+            raise InvalidValueError(node.span, Code.WRONG_TYPE, "a list within a list is not a datagram")
         times = _times(node)
         content = [(name, entry) for name, entry in node.entries.items() if name != "times"]
         if not content:
@@ -373,7 +379,7 @@ class ExpectedReader:
         if not _is(node, UNCHANGED):
             return self._fields.message(kind, node)
         if not isinstance(given, MappingNode) or "hex" in given.entries:
-            raise invalid(node.span, Code.BAD_VALUE, "'unchanged' needs fields that are given in this step")
+            raise InvalidValueError(node.span, Code.BAD_VALUE, "'unchanged' needs fields that are given in this step")
         fields = given.get("fields") or given.get("message")
         return self._given.message(kind, fields) if fields else Fields(kind, {}, node.span)
 
@@ -403,7 +409,7 @@ def _reasons(node: Node, known: Iterable[str]) -> Counts:
         named = [_name(item) for item in _listed(node)]
     for name, span in named:
         if name not in known:
-            raise invalid(span, Code.BAD_VALUE, f"there is no reason '{name}'", did_you_mean(name, known))
+            raise InvalidValueError(span, Code.BAD_VALUE, f"there is no reason '{name}'", did_you_mean(name, known))
     if isinstance(node, MappingNode):
         return {name: _count(entry.value) for name, entry in node.entries.items()}
     return Counter(name for name, _ in named)
@@ -415,13 +421,13 @@ def _of_word(node: ScalarNode, given: Node | None) -> Delivery:
     if node.text == ANY:
         return Delivery(node.span)
     hint = f"write {UNCHANGED}, {ANY}, or {{CASE: {{FIELD: value}}}}"
-    raise invalid(node.span, Code.BAD_VALUE, f"'{node.text}' is not a datagram", hint)
+    raise InvalidValueError(node.span, Code.BAD_VALUE, f"'{node.text}' is not a datagram", hint)
 
 
 def _unchanged(span: SourceSpan, given: Node | None) -> Delivery:
     if not isinstance(given, MappingNode) or "topic" in given.entries:
         message = "'unchanged' needs a datagram that is given in this step"
-        raise invalid(span, Code.BAD_VALUE, message, "write {ENDPOINT: {CASE: {FIELD: value}}}")
+        raise InvalidValueError(span, Code.BAD_VALUE, message, "write {ENDPOINT: {CASE: {FIELD: value}}}")
     return Delivery(span, is_unchanged=True)
 
 
@@ -429,7 +435,7 @@ def _bytes(node: Node) -> bytes:
     try:
         return bytes.fromhex(_name(node)[0])
     except ValueError:
-        raise invalid(node.span, Code.BAD_VALUE, "'hex' takes bytes in quotes, such as '0a 05'") from None
+        raise InvalidValueError(node.span, Code.BAD_VALUE, "'hex' takes bytes in quotes, such as '0a 05'") from None
 
 
 def _times(node: MappingNode) -> int:
@@ -440,7 +446,7 @@ def _times(node: MappingNode) -> int:
 def _count(node: Node) -> int:
     value = node.value if isinstance(node, ScalarNode) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST:
-        raise invalid(node.span, Code.BAD_VALUE, f"this must be a whole number from 1 to {_MOST}")
+        raise InvalidValueError(node.span, Code.BAD_VALUE, f"this must be a whole number from 1 to {_MOST}")
     return value
 
 
@@ -449,12 +455,12 @@ def _refuse_repeated(named: Sequence[tuple[str, SourceSpan]]) -> None:
     for index, (name, span) in enumerate(named):
         if name in names[:index]:
             hint = f"if it gets the datagram twice, write {{{name}: {{times: 2}}}}"
-            raise invalid(span, Code.BAD_VALUE, f"'{name}' is named twice", hint)
+            raise InvalidValueError(span, Code.BAD_VALUE, f"'{name}' is named twice", hint)
 
 
 def _name(node: Node) -> tuple[str, SourceSpan]:
     if not isinstance(node, ScalarNode):
-        raise invalid(node.span, Code.WRONG_TYPE, "this must be a name")
+        raise InvalidValueError(node.span, Code.WRONG_TYPE, "this must be a name")
     return node.text, node.span
 
 

@@ -15,7 +15,7 @@ from router.datagrams import Decoded, Wire
 from router.errors import DecodeError, UsageError, did_you_mean
 from router.table.model import EndpointKind, Priority, RouteTable
 from router.types.model import MessageType
-from router.values import compact
+from router.values.printing import compact
 
 TIMEOUT = 1.0
 """Seconds without a command after which a board stops on its own, or is reported as continuing the last one."""

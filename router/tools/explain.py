@@ -47,7 +47,7 @@ from router.tools.udp import LOOPBACK, origin
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.boards import framed_size
 from router.types.protobuf import PayloadCase
-from router.values import payload
+from router.values.reading import payload
 
 if TYPE_CHECKING:  # which imports rclpy
     from router.ros.graph import Mistyped

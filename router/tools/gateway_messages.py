@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Union
 
 from router.gateway.packets import HEAD, Packet, PacketError, decompress, unpack
-from router.values import SHOWN_ELEMENTS, Tree, clock_text, list_text, one_line, plain_text, words
+from router.values.printing import SHOWN_ELEMENTS, Tree, clock_text, list_text, one_line, plain_text, words
 
 MOST_TEXT = 256 << 20
 """Bytes of the longest message that a gateway can be configured to send."""

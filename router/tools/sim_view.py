@@ -12,7 +12,7 @@ from rich.text import Text
 from router.datagrams import Wire
 from router.tools.board import Arrivals, Change, State
 from router.tools.simulator import Statistics
-from router.values import compact, protobuf_json, rate_text
+from router.values.printing import compact, protobuf_json, rate_text
 
 DIGITS = 4
 

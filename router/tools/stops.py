@@ -16,7 +16,7 @@ from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT,
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model import ANY
 from router.tools.tap import local_time, utc_text
-from router.values import compact, time_text
+from router.values.printing import compact, time_text
 
 _MS = 1_000_000
 _UNKNOWN = RecordedRoute("", (), False, 0.0, ())

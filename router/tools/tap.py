@@ -29,7 +29,7 @@ from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase
-from router.values import clock_text, compact, one_line, protobuf_json, ros_json, ros_tree, words
+from router.values.printing import clock_text, compact, one_line, protobuf_json, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.recording.reader import Recorded

@@ -16,7 +16,7 @@ from rich.text import Text
 from router.compiler.metrics import INTENDED_REASONS, LATENCY_BOUNDS_NS
 from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered
-from router.values import age_text, rate_text, shortened
+from router.values.printing import age_text, rate_text, shortened
 
 Cell = Callable[[RouteRow], Text]
 

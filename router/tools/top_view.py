@@ -19,7 +19,7 @@ from rich.text import Text
 
 from router.tools.top import Order, View, unwanted
 from router.tools.top_table import RouteTable, reasons_text
-from router.values import age_text, rate_text, shortened
+from router.values.printing import age_text, rate_text, shortened
 
 _ENDPOINT_LINES = 4
 """Maximum lines of endpoints on a screen; silent endpoints are also among the problems above."""

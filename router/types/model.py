@@ -92,6 +92,11 @@ class List:
         """The type of an entry of a protobuf map, with its key and its value; None for other lists."""
         return self.element if isinstance(self.element, MessageType) and self.element.is_map_entry else None
 
+    @property
+    def content(self) -> Type:
+        """The type of an element; of a value in a protobuf map."""
+        return self.element if self.entry is None else self.entry.fields[1].type
+
     def __str__(self) -> str:
         size = str(self.length) if self.length is not None else f"<={self.bound}" if self.bound is not None else ""
         return f"{self.element}[{size}]"

@@ -15,7 +15,7 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.cli import BAD_TABLE, BAD_USAGE, main
 from router.tools.running_router import post
-from router.values import protobuf_tree, words
+from router.values.printing import protobuf_tree, words
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import RouterProcess, Site, site, wait_until
 from tests.everything import odd, payload, unroutable, usual, wire

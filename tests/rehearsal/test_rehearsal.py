@@ -14,7 +14,7 @@ from router.app import Router
 from router.compiler import check_table
 from router.datagrams import Wire, wire_of_protos
 from router.rehearsal.rehearsal import START, Filtered, Received, Rehearsal, Rejected, Sent, Superseded
-from router.values import payload
+from router.values.reading import payload
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import wait_until
 from tests.ports import free_port

@@ -195,6 +195,22 @@ def test_a_map_is_written_as_keys_and_values_in_any_order(tmp_path: Path) -> Non
         every_kind(tmp_path, expected.replace("{5: {x: 6}}", "7"))
 
 
+def test_a_struct_is_written_as_its_fields(tmp_path: Path) -> None:
+    (tmp_path / "kinds.proto").write_text(
+        'syntax = "proto3"; import "google/protobuf/struct.proto";'
+        "message Kind { google.protobuf.Struct object = 1; }"
+        "message PBEnvelope { oneof payload { Kind kind = 1; } }"
+    )
+    tests = """
+        a:
+          given: {case: kind, from: left_tool, listener: exact, fields: {object: {fields: {a: {number_value: 1.5}}}}}
+          expect: {sent: {right_tool: {kind: {object: {fields: {a: {number_value: 2.5}}}}}}}
+        """
+    head = HEAD.replace("PROTOS", str(tmp_path))
+    said = messages(tmp_path, "kind: {source: left_tool, destinations: [right_tool]}", tests, head)
+    assert said == ["right_tool: object.fields[0].value.number_value is 1.5, not 2.5"]
+
+
 def test_every_kind_of_field_is_told_where_it_is_not_expected(tmp_path: Path) -> None:
     assert [
         said.removeprefix("right_tool: ").replace(", not at its default", "") for said in every_kind(tmp_path, "{}")

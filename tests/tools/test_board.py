@@ -8,7 +8,7 @@ from router.compiler.program import DeadmanPlan
 from router.datagrams import Decoded, Wire, wire_of_protos
 from router.table.model import RouteTable
 from router.tools.board import FRAME_TIMEOUT, Board, Change, Frames, State, Stop, boards, is_part
-from router.values import payload
+from router.values.reading import payload
 from tests.tables import PROTOS
 
 

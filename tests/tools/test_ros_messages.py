@@ -8,7 +8,7 @@ from sensor_msgs.msg import Imu, Joy
 from std_msgs.msg import Header
 
 from demo.ros_messages import filled, message_class
-from router.values import ros_json
+from router.values.printing import ros_json
 
 STAMP = Header().stamp
 

@@ -14,7 +14,7 @@ from router.recording.mirror import BRAKED, SENT, TRIPPED, Action, MirroredDatag
 from router.table.addresses import Address
 from router.tools.tap import Condition, Filter, RunningTap, listen, tapped_datagram
 from router.tools.udp import open_udp
-from router.values import payload
+from router.values.reading import payload
 from tests.observe.fake_running import sim_program
 
 

@@ -1,7 +1,7 @@
-"""Parses and formats message fields as `field=value` words, for all verbs.
+"""Prints messages and values: as `field=value` words, as JSON, and as short texts for tables.
 
-`router send` parses these words; `tap`, `listen` and `sim` print them. For protobuf messages the two are inverse.
-To print them, values of any source are first converted to a `Tree`.
+To print words, values of any source are first converted to a `Tree`. `reading.payload` reads the words of a protobuf
+message again.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import json
 import math
 import re
 import struct
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple, Union
@@ -21,251 +20,7 @@ from google.protobuf.json_format import Error as NoJsonError
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError, Message
 
-from router.errors import UsageError, did_you_mean
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from router.types.protobuf import PayloadCase
-
-# Parsing
-
-
-def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
-    """Return a payload with these `field=value` words applied. Raises UsageError."""
-    message = case.message_class()
-    set_fields(message, case.type, assignments)
-    return message
-
-
-def set_fields(message: Message, kind: MessageType, assignments: Sequence[str]) -> None:
-    """Apply `path=value` words in order. A path is `x`, `bbox.x`, `points[1]`, `boxes[0].x` or `counts[left]`.
-
-    The key of a map needs quotes, as in `counts["a.b"]`, unless it has only letters, digits, `_` and `-`. A list
-    without an index is appended to; `bbox=` alone makes an empty message present. Raises UsageError.
-    """
-    for assignment in assignments:
-        match = _ASSIGNMENT.fullmatch(assignment)
-        if match is None:
-            raise UsageError(f"'{assignment}' is not an assignment", f"write {assignment or 'field'}=value")
-        _assign(message, kind, match["path"], match["text"])
-
-
-_QUOTED = r'"(?:[^"\\]|\\.)*"'
-_ASSIGNMENT = re.compile(rf"(?P<path>(?:[^=\"]|{_QUOTED})*)=(?P<text>.*)", re.DOTALL)
-_DOT = re.compile(rf"\.(?=(?:[^\"]|{_QUOTED})*$)")  # outside of quotes
-_STEP = re.compile(rf"(?P<name>\w+)(?:\[(?P<index>[\w-]+|{_QUOTED})\])?")
-
-
-def _assign(message: Any, kind: MessageType, path: str, text: str) -> None:
-    *parents, last = _DOT.split(path)
-    for position, step in enumerate(parents):
-        field, index = _step(kind, step, path)
-        inner = _content(field.type)
-        if not isinstance(inner, MessageType):
-            here = ".".join(parents[: position + 1])
-            if index is None and isinstance(field.type, List) and field.type.entry is not None:
-                key = [*parents, last][position + 1]
-                raise UsageError(f"{here} is a map", f"name a value, such as {here}[{key}]=...")
-            raise UsageError(f"{here} of {kind.name} is {inner}, which has no fields")
-        message = _inner_message(message, field, index, path)
-        kind = inner
-    field, index = _step(kind, last, path)
-    if isinstance(field.type, List):
-        _assign_element(getattr(message, field.name), field.type, index, path, text)
-    elif index is not None:
-        raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
-    elif isinstance(field.type, MessageType) and not text:
-        getattr(message, field.name).SetInParent()
-    else:
-        setattr(message, field.name, parse(field.type, text, path))
-
-
-def _content(kind: Type) -> Type:
-    """Return the type of a list's elements, of a map's values, or of a single field."""
-    if not isinstance(kind, List):
-        return kind
-    return kind.element if kind.entry is None else kind.entry.fields[1].type
-
-
-def _step(kind: MessageType, step: str, path: str) -> tuple[Field, str | None]:
-    """Return the field, and the index or key in brackets."""
-    match = _STEP.fullmatch(step)
-    if match is None:
-        hint = "write it as x, bbox.x, points[0] or counts[key]: elements count from 0"
-        raise UsageError(f"'{path}' is not a field path", hint)
-    field = kind.field(match["name"])
-    if field is None:
-        hint = did_you_mean(match["name"], (known.name for known in kind.fields))
-        raise UsageError(f"{kind.name} has no field '{match['name']}'", hint)
-    return field, match["index"]
-
-
-def _inner_message(message: Any, field: Field, index: str | None, path: str) -> Any:
-    member = getattr(message, field.name)
-    if not isinstance(field.type, List):
-        if index is not None:
-            raise UsageError(f"{path}: {field.name} is {field.type}, not a list")
-        member.SetInParent()
-        return member
-    if index is None:
-        what, example = "a list", path.replace(field.name, f"{field.name}[0]", 1)
-        if field.type.entry is not None:
-            what, example = "a map", path.replace(field.name, f"{field.name}[key]", 1)
-        raise UsageError(f"{path}: {field.name} is {what}", f"name an element, such as {example}=...")
-    if field.type.entry is not None:
-        return member.get_or_create(_key(member, field.type, index, path))
-    position = _position(index, path)
-    _extend(member, field.type, position, path)
-    return member[position]
-
-
-def _assign_element(values: Any, kind: List, index: str | None, path: str, text: str) -> None:
-    if kind.entry is not None:
-        _assign_entry(values, kind, index, path, text)
-        return
-    is_whole = index is None and not isinstance(kind.element, (String, Bytes)) and re.search(r"^\[|,", text)
-    if is_whole or (index is None and text and isinstance(kind.element, MessageType)):
-        member = f".{kind.element.fields[0].name}" if isinstance(kind.element, MessageType) else ""
-        hint = f"write each element: {path}[0]{member}=... {path}[1]{member}=..."
-        raise UsageError(f"{path} is a list, {kind}, and '{text}' is no element of it", hint)
-    position = len(values) if index is None else _position(index, path)
-    if isinstance(kind.element, MessageType) and not text:
-        _extend(values, kind, position, path)
-        return
-    value = parse(kind.element, text, path)
-    _extend(values, kind, position, path)
-    values[position] = value
-
-
-def _assign_entry(values: Any, kind: List, index: str | None, path: str, text: str) -> None:
-    if index is None:
-        raise UsageError(f"{path} is a map", f"name a value, such as {path}[key]=...")
-    key, content = _key(values, kind, index, path), _content(kind)
-    if isinstance(content, MessageType) and not text:
-        values.get_or_create(key)
-    else:
-        values[key] = parse(content, text, path)
-
-
-def _position(index: str, path: str) -> int:
-    if not index.isdecimal():
-        raise UsageError(f"{path}: '{index}' is not an index", "elements are numbered from 0")
-    return int(index)
-
-
-def _key(values: Any, kind: List, text: str, path: str) -> Any:
-    """Parse the key of a map, for which it has room."""
-    assert kind.entry is not None  # noqa: S101 - it is a map
-    try:
-        key = parse(kind.entry.fields[0].type, json.loads(text) if text.startswith('"') else text, path)
-    except json.JSONDecodeError as error:
-        raise UsageError(f"{path}: {text} is not a key: {error.msg}", "quote it as in JSON") from error
-    if key not in values:
-        _check_room(kind, len(values), path)
-    return key
-
-
-LARGEST_LIST = 65_507
-"""Maximum number of elements: no list has more than the largest datagram has bytes."""
-
-_ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Float: 0.0, String: "", Bytes: b""}
-
-
-def zero(kind: Type) -> object:
-    """Return the value of a scalar that is not set; of an enum, its first value."""
-    return kind.values[0][1] if isinstance(kind, Enum) else _ZEROS[type(kind)]
-
-
-def _extend(values: Any, kind: List, index: int, path: str) -> None:
-    """Extend the list with zeros up to `index`."""
-    _check_room(kind, index, path)
-    while len(values) <= index:
-        if isinstance(kind.element, MessageType):
-            values.add()
-        else:
-            values.append(zero(kind.element))
-
-
-def _check_room(kind: List, index: int, path: str) -> None:
-    bound = kind.length if kind.length is not None else kind.bound
-    limit = LARGEST_LIST if bound is None else bound
-    if index >= limit:
-        raise UsageError(f"{path}: {kind} holds at most {limit} elements")
-
-
-_TRUTH = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
-_LARGEST = {32: 3.4028235e38, 64: sys.float_info.max}
-_ENUM_RANGE = Int(32, signed=True)
-
-
-def parse(kind: Type, text: str, path: str) -> object:
-    """Parse a value of a scalar type. `path` names the field in errors. Raises UsageError."""
-    match kind:
-        case Bool():
-            if text.lower() not in _TRUTH:
-                raise UsageError(f"{path}: '{text}' is not a bool", "write true or false")
-            return _TRUTH[text.lower()]
-        case Int():
-            return _parse_int(kind, text, path)
-        case Float():
-            return _parse_float(kind, text, path)
-        case Enum():
-            return _parse_enum(kind, text, path)
-        case String(bound=bound):
-            if bound is not None and len(text.encode()) > bound:
-                raise UsageError(f"{path}: '{text}' has {len(text.encode())} bytes, {kind} holds at most {bound}")
-            return text
-        case Bytes():
-            return _parse_bytes(kind, text, path)
-        case _:
-            field = kind.fields[0].name if isinstance(kind, MessageType) and kind.fields else "x"
-            raise UsageError(f"{path} is the message {kind}", f"set its fields, such as {path}.{field}=...")
-
-
-def _parse_int(kind: Int, text: str, path: str) -> int:
-    try:
-        value = int(text, 0)
-    except ValueError:
-        raise UsageError(f"{path}: '{text}' is not an integer ({kind})", "write it as 42, -1 or 0x2a") from None
-    if not kind.low <= value <= kind.high:
-        raise UsageError(f"{path}: {text} does not fit {kind}, which holds {kind.low} to {kind.high}")
-    return value
-
-
-def _parse_float(kind: Float, text: str, path: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UsageError(f"{path}: '{text}' is not a number ({kind})", "write it as 1.5, -2e3, nan or inf") from None
-    largest = _LARGEST[kind.bits]
-    if abs(value) > largest and "inf" not in text.lower():
-        raise UsageError(f"{path}: {text} does not fit {kind}, which holds {-largest!r} to {largest!r}")
-    return value
-
-
-def _parse_enum(kind: Enum, text: str, path: str) -> int:
-    """Parse a name, qualified or not (`SensorState.SENSOR_ERROR`), or a number: any int32 for an open enum."""
-    values = dict(kind.values)
-    name = text.removeprefix(f"{kind.name}.").removeprefix(f"{kind.name.rpartition('.')[2]}.")
-    if name in values:
-        return values[name]
-    if text.lstrip("-")[:1].isdigit():
-        number = _parse_int(_ENUM_RANGE, text, path)
-        if not kind.is_closed or number in values.values():
-            return number
-    raise UsageError(f"{path}: {kind.name} has no value '{text}'", did_you_mean(name, values))
-
-
-def _parse_bytes(kind: Bytes, text: str, path: str) -> bytes:
-    try:
-        value = bytes.fromhex(text.removeprefix("0x"))
-    except ValueError:
-        raise UsageError(f"{path}: '{text}' is not hex", "write bytes as 0a1b2c") from None
-    if kind.bound is not None and len(value) > kind.bound:
-        raise UsageError(f"{path}: {len(value)} bytes do not fit {kind}, which holds at most {kind.bound}")
-    return value
-
-
-# Printing
-
+from router.types.model import Enum, Float, List, MessageType, Type
 
 Tree = Union[str, Mapping[str, "Tree"]]
 """The text of a scalar or of a list of scalars; or the members of a message by name, with `x[0]` for an element."""
@@ -376,7 +131,7 @@ def protobuf_tree(message: Any, kind: MessageType, digits: int | None = None) ->
         value = getattr(message, field.name)
         if isinstance(field.type, List):
             for index, element in _indexed(field.type, value):
-                tree[f"{field.name}[{index}]"] = _protobuf_value(element, _content(field.type), digits)
+                tree[f"{field.name}[{index}]"] = _protobuf_value(element, field.type.content, digits)
         elif isinstance(field.type, MessageType) or field.has_presence:
             if message.HasField(field.name):
                 tree[field.name] = _protobuf_value(value, field.type, digits)
