@@ -29,7 +29,7 @@ from router.cli.tool_options import (
 from router.errors import StartError, TransportError, UsageError
 
 if TYPE_CHECKING:
-    from router.tools.gateway_messages import Received
+    from router.tools.gateway_client import Received
 
 FORMATS = ("gateway_v1", "json_lines")
 GATEWAYS = ("udp", "tcp", "ws", "zenoh")
@@ -110,8 +110,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _listen_to_gateway(args: argparse.Namespace) -> None:
     from router.table.model import GatewayFormat
-    from router.tools.gateway_client import GatewayClient, topic_filter
-    from router.tools.gateway_messages import Message
+    from router.tools.gateway_client import GatewayClient, Message, topic_filter
     from router.tools.gateway_sources import open_source
     from router.tools.udp import destination
 
@@ -177,7 +176,7 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
 @contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[Received], None]]:
     """Yield a function that appends a line to the file, unbuffered. Raises UsageError."""
-    from router.tools.gateway_messages import json_line
+    from router.tools.gateway_client import json_line
 
     if path is None:
         yield lambda _: None
@@ -201,7 +200,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Received], None]]:
 
 def _printer(as_json: bool) -> Callable[[Received], None]:
     """Return a function that prints one line: on a terminal, in colour and cut to its width."""
-    from router.tools.gateway_messages import json_line, pieces
+    from router.tools.gateway_client import json_line, pieces
 
     if as_json:
         return lambda received: print(json_line(received), flush=True)

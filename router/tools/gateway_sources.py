@@ -23,7 +23,9 @@ from router.table.addresses import Address
 from router.table.model import GatewayFormat, ZenohConfig, ZenohSettings
 from router.table.units import LARGEST_DATAGRAM
 from router.tools import udp
-from router.tools.gateway_messages import MOST_TEXT
+
+MOST_TEXT = 256 << 20
+"""Bytes of the longest message that a gateway can be configured to send."""
 
 Say = Callable[[str], None]
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from router.gateway.documents import data_document, schema_document
 from router.gateway.packets import Packet, pack
-from router.tools.gateway_client import GatewayClient, topic_filter
-from router.tools.gateway_messages import Message, Received, Schema, Shape, json_line, pieces
+from router.tools.gateway_client import GatewayClient, Message, Received, Schema, Shape, json_line, pieces, topic_filter
 from router.tools.gateway_sources import Arrival, Source, open_source
 from tests.ports import free_port
 

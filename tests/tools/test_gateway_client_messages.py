@@ -8,7 +8,7 @@ import pytest
 
 from router.gateway.documents import data_document, rejected_document, schema_document
 from router.gateway.packets import Packet, PacketError, compress, pack
-from router.tools.gateway_messages import Message, Problem, Received, Remark, Schema, Shape, json_line, pieces, read
+from router.tools.gateway_client import Message, Problem, Received, Remark, Schema, Shape, json_line, pieces, read
 
 HEADER = {
     "name": "Header",
