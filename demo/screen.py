@@ -14,7 +14,7 @@ from demo.expected import active_routes
 from demo.verdict import Said, arrival_count, topic_count
 from router.table.model import RouteTable
 from router.tools.top import Order, RouteRow, View
-from router.tools.top_table import RouteTable as Routes
+from router.tools.top_view import RouteTable as Routes
 from router.tools.top_view import summary_line
 
 LINE_INTERVAL = 3.0

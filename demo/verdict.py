@@ -22,7 +22,7 @@ from demo.page import Shown
 from demo.recorded import Recorded
 from router.table.model import RouteTable
 from router.tools.top import View
-from router.tools.top_table import reasons_text
+from router.tools.top_view import reasons_text
 
 WANTED_DROPS = frozenset({"rate_limited", "stale"})
 """Losses that a table intends, by `max_rate` and `ttl`."""

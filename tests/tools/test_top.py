@@ -16,8 +16,7 @@ from router.compiler.metrics import LATENCY_BOUNDS_NS
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
 from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
-from router.tools.top_table import latency_text, reasons_text, targets_text
-from router.tools.top_view import Page, Screen, keys
+from router.tools.top_view import Page, Screen, keys, latency_text, reasons_text, targets_text
 from router.values.printing import age_text
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in LATENCY_BOUNDS_NS), "+Inf")
