@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import datetime as dt
+import heapq
+import re
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from router.cli import OK, Subparsers, add_verb
 from router.cli.tool_options import say, seconds
@@ -15,8 +18,9 @@ from router.errors import UsageError
 
 if TYPE_CHECKING:
     from router.datagrams import Wire
-    from router.recording.reader import Recording
-    from router.tools.show import Entry
+    from router.recording.reader import Recorded, RecordedAction, Recording
+
+Entry: TypeAlias = "Recorded | RecordedAction"
 
 _DESCRIPTION = """Print a recording: what the router received, rejected and dropped, what it sent by itself, and when
 deadman timers tripped. With --why, print for each of these when that was, why, and what last fed it. Neither the
@@ -28,6 +32,11 @@ _EXAMPLES = (
 )
 _MARGIN = 30.0
 _BATCH = 500
+_DISORDER = 1_000_000_000
+"""ns by which entries of a recording may be out of order, at most; the mirror's PERIOD is much shorter."""
+
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d)(\.\d+)?)?")
+_SECONDS = re.compile(r"\d:\d\d:\d\d")
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -49,7 +58,6 @@ def run(args: argparse.Namespace) -> int:
     from router.datagrams import Wire
     from router.recording.reader import Recording
     from router.recording.schemas import recorded_envelope
-    from router.tools.show import in_order
 
     if args.why and (args.cases or args.where):
         raise UsageError("--why explains whole stops", "leave out --case and --where")
@@ -69,6 +77,44 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
+def in_order(entries: Iterable[Entry]) -> Iterator[Entry]:
+    """Yield the entries in the order of time, without steps of the wall clock."""
+    waiting: list[tuple[int, int, Entry]] = []
+    for number, entry in enumerate(entries):
+        heapq.heappush(waiting, (entry.steady, number, entry))
+        while entry.steady - waiting[0][0] > _DISORDER:
+            yield heapq.heappop(waiting)[-1]
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
+
+
+def window(around: str, margin: float, first: int) -> tuple[int, int]:
+    """Return begin and end (ns) of the time `around`, with `margin` seconds before and after it.
+
+    It is a local time of day, or a date and time. Without seconds it is a whole minute. A time of day is the next one
+    after `first`, the beginning of the recording (ns). Raises UsageError.
+    """
+    from router.tools.tap import local_time
+
+    begin = local_time(first)
+    try:
+        if (found := _TIME_OF_DAY.fullmatch(around)) is not None:
+            hour, minute, second = (int(part or 0) for part in found.groups()[:3])
+            at = begin.replace(hour=hour, minute=minute, second=second, microsecond=0)
+            has_seconds = found[3] is not None
+            if at + dt.timedelta(minutes=1) < begin - dt.timedelta(seconds=margin):
+                at += dt.timedelta(days=1)
+        else:
+            at = dt.datetime.fromisoformat(around.removesuffix("Z") + "+00:00" * around.endswith("Z")).astimezone()
+            has_seconds = _SECONDS.search(around) is not None
+    except ValueError:
+        how = "give a local time such as 14:03 or 14:03:07, or a date and time such as 2026-04-12T14:03:07"
+        raise UsageError(f"--around: '{around}' is not a time", how) from None
+    start = int(at.timestamp() * 1e9)
+    extra = int(margin * 1e9)
+    return start - extra, start + (1 if has_seconds else 60) * 1_000_000_000 + extra
+
+
 def _say_what(recording: Recording, first: Entry) -> None:
     from router.recording.about import tripped_in
     from router.tools.tap import local_time
@@ -85,8 +131,6 @@ def _say_what(recording: Recording, first: Entry) -> None:
 
 
 def _window(args: argparse.Namespace, first: Entry) -> tuple[int, int] | None:
-    from router.tools.show import window
-
     if args.around is None:
         return None
     return window(args.around, _MARGIN if args.margin is None else args.margin, first.at)

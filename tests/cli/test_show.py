@@ -15,6 +15,7 @@ from types import MappingProxyType
 import pytest
 
 from router.cli import main
+from router.cli.show import in_order, window
 from router.errors import UsageError
 from router.recording.about import RecordedRoute
 from router.recording.channels import Channels
@@ -22,7 +23,6 @@ from router.recording.encoder import Encoder
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.recording.reader import Recording
 from router.recording.writer import RecordingFile
-from router.tools.show import in_order, window
 from tests.recording.recorder_rig import MILLISECOND, SENSOR_BOARD, classifier, shown, taken, wire
 
 JUNK = "malformed: does not parse as rover_router.Recorded"
