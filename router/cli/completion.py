@@ -29,10 +29,10 @@ def completes(action: argparse.Action, words: Words) -> None:
     """Make the shell complete an argument with `words`."""
 
     def completer(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
-        found: list[str] = []
+        completions: list[str] = []
         with suppress(RouterError, OSError, LookupError):
-            found.extend(words(parsed_args, prefix))
-        return list(dict.fromkeys(found))
+            completions.extend(words(parsed_args, prefix))
+        return list(dict.fromkeys(completions))
 
     action.completer = completer  # type: ignore[attr-defined]  # where argcomplete looks
 
@@ -56,7 +56,7 @@ def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     from router.table.model import EndpointKind
 
     if table := _table(args):
-        yield from (each.name for each in table.endpoints.values() if each.kind is not EndpointKind.TOOL)
+        yield from (endpoint.name for endpoint in table.endpoints.values() if endpoint.kind is not EndpointKind.TOOL)
 
 
 def places(args: argparse.Namespace, _: str = "") -> Iterable[str]:

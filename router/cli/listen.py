@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"'{scheme}' has no scheme", f"write {forms}")
     for name, (option, schemes) in _BELONGS_TO.items():
         if getattr(args, name) and scheme not in schemes:
-            raise UsageError(f"{option} works only with {', '.join(f'{each}://' for each in schemes)}")
+            raise UsageError(f"{option} works only with {', '.join(f'{scheme}://' for scheme in schemes)}")
     if scheme == "envelope":
         _listen_to_port(rest, args)
     elif scheme == "topic":
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     elif scheme in GATEWAYS:
         _listen_to_gateway(args)
     else:
-        places = ", ".join(f"{each}://" for each in (*GATEWAYS, "envelope", "topic"))
+        places = ", ".join(f"{scheme}://" for scheme in (*GATEWAYS, "envelope", "topic"))
         raise UsageError(f"there is no scheme '{scheme}://'", f"the schemes are {places}")
     return 0
 

@@ -114,8 +114,8 @@ def _site(checked: Checked) -> Site:
 def _new_findings(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
     """Return the new findings, compared by message, because lines have moved."""
     known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
-    found = {finding: None for checked in after for finding in checked.diagnostics}
-    return [finding for finding in found if (finding.code, finding.message) not in known]
+    findings = {finding: None for checked in after for finding in checked.diagnostics}
+    return [finding for finding in findings if (finding.code, finding.message) not in known]
 
 
 def _report(message: NewMessage, written: Written, unrouted: Sequence[Path], before: Site, after: Site) -> None:

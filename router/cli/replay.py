@@ -75,8 +75,8 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
     origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
     with until_interrupted(), closing(replayer), _progress(recording, "sending") as update:
-        for found in on_time(recording, args.speed or 1.0):
-            replayer.send(found)
+        for datagram in on_time(recording, args.speed or 1.0):
+            replayer.send(datagram)
             update(completed=recording.position)
     print(f"sent {replayer.resent.datagrams} datagrams")
     return _advise(replayer.resent)
@@ -104,8 +104,8 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     new, after = good_table(args.against, definitions=definitions)
     against = Against(before, after)
     with _progress(recording, "comparing") as update:
-        for found in recording.datagrams():
-            against.take(found)
+        for datagram in recording.datagrams():
+            against.take(datagram)
             update(completed=recording.position)
     for line in Report(old, new).lines(against):
         print(line)

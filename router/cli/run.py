@@ -149,12 +149,12 @@ def route(
 
 def _show_places(router: Router, reachable: Callable[[Address], Address]) -> None:
     """Log the addresses of pages and gateways: on a terminal one per line, elsewhere as one record."""
-    found = dict(_places(router, reachable))
-    if found and not sys.stderr.isatty():
-        logger.info("where to look", **found)
-    elif found:
-        width = max(map(len, found))
-        logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
+    places = dict(_places(router, reachable))
+    if places and not sys.stderr.isatty():
+        logger.info("where to look", **places)
+    elif places:
+        width = max(map(len, places))
+        logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in places.items())]))
 
 
 def _places(router: Router, reachable: Callable[[Address], Address]) -> Iterator[tuple[str, str]]:

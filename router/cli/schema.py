@@ -65,12 +65,12 @@ def run(args: argparse.Namespace) -> int:
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
     envelope = find_envelope(schema, settings.oneof)
     lock = LockComparison(schema, envelope)
-    found = lock.conflicts
-    accepted = _accepted(args.accept, found)
-    if refused := [each for each in found if each not in accepted]:
-        print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
-        if len(found) > 1:
-            names = " ".join(f"--accept {each.name}" for each in found)
+    conflicts = lock.conflicts
+    accepted = _accepted(args.accept, conflicts)
+    if refused := [conflict for conflict in conflicts if conflict not in accepted]:
+        print_findings(sorted((conflict.finding for conflict in refused), key=lambda finding: finding.span), sys.stdout)
+        if len(conflicts) > 1:
+            names = " ".join(f"--accept {conflict.name}" for conflict in conflicts)
             print(f"nothing was written; if all of these changes are intended, accept them together: {names}")
         return BAD_TABLE
     new = lock.extended(accepted)
@@ -117,25 +117,25 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
     return replace(settings, message=Located(message, span), oneof=Located(oneof, span))
 
 
-def _accepted(names: Sequence[str], found: Sequence[Conflict]) -> list[Conflict]:
-    """Return the conflicts in `found` that `names` refer to. Raises UsageError for a name that fits none or several."""
-    accepted = [each for name in names for each in _meant(name, found)]
-    return [each for each in found if each in accepted]
+def _accepted(names: Sequence[str], conflicts: Sequence[Conflict]) -> list[Conflict]:
+    """Return the `conflicts` that `names` refer to. Raises UsageError for a name that fits none or several."""
+    accepted = [conflict for name in names for conflict in _meant(name, conflicts)]
+    return [conflict for conflict in conflicts if conflict in accepted]
 
 
-def _meant(name: str, found: Sequence[Conflict]) -> list[Conflict]:
+def _meant(name: str, conflicts: Sequence[Conflict]) -> list[Conflict]:
     """Return the conflict of that name, or all conflicts of a message. `name` may omit package and enclosing messages.
 
     A field may also be named as in the lock. Raises UsageError.
     """
-    if exact := [each for each in found if name in (each.name, each.owner)]:
+    if exact := [conflict for conflict in conflicts if name in (conflict.name, conflict.owner)]:
         return exact
-    known = {full for each in found for full in (each.name, each.owner)}
-    former = {f"{each.owner}.{entry.name}": each.name for each in found for entry in each.entries}
-    full = sorted(each for each in known if each.endswith(f".{name}"))
+    known = {full for conflict in conflicts for full in (conflict.name, conflict.owner)}
+    former = {f"{conflict.owner}.{entry.name}": conflict.name for conflict in conflicts for entry in conflict.entries}
+    full = sorted(known_name for known_name in known if known_name.endswith(f".{name}"))
     full = full or sorted({now for was, now in former.items() if f".{was}".endswith(f".{name}")})
     if len(full) == 1:
-        return _meant(full[0], found)
+        return _meant(full[0], conflicts)
     if full:
         raise UsageError(f"'{name}' may be {' or '.join(full)}; nothing was written", "write its full name")
     hint = did_you_mean(name, known) or "nothing conflicts with the lock"
@@ -157,4 +157,4 @@ def _summary(old: Lock | None, new: Lock, unbounded: str) -> str:
 def _numbers(lock: Lock) -> set[tuple[str, int, str]]:
     """Return the numbers in use, regardless of the package."""
     declared = (*lock.messages.items(), *lock.enums.items())
-    return {(short_name(owner), each.number, each.name) for owner, members in declared for each in members.entries}
+    return {(short_name(owner), entry.number, entry.name) for owner, members in declared for entry in members.entries}

@@ -98,10 +98,10 @@ def window(around: str, margin: float, first: int) -> tuple[int, int]:
 
     begin = local_time(first)
     try:
-        if (found := _TIME_OF_DAY.fullmatch(around)) is not None:
-            hour, minute, second = (int(part or 0) for part in found.groups()[:3])
+        if (time_of_day := _TIME_OF_DAY.fullmatch(around)) is not None:
+            hour, minute, second = (int(part or 0) for part in time_of_day.groups()[:3])
             at = begin.replace(hour=hour, minute=minute, second=second, microsecond=0)
-            has_seconds = found[3] is not None
+            has_seconds = time_of_day[3] is not None
             if at + dt.timedelta(minutes=1) < begin - dt.timedelta(seconds=margin):
                 at += dt.timedelta(days=1)
         else:
@@ -140,7 +140,7 @@ def _say_nothing(span: tuple[int, int], what: str, last: int) -> None:
     from router.tools.tap import local_time
     from router.values.printing import time_text
 
-    begin, end, last_shown = (time_text(local_time(each)) for each in (*span, last))
+    begin, end, last_shown = (time_text(local_time(at)) for at in (*span, last))
     say(f"{what} between {begin} and {end}; the recording ends at {last_shown}")
 
 
@@ -164,8 +164,8 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
                 if chosen.takes(as_shown, entry.at):
                     yield as_shown.json(False) if args.json else as_shown.line(False)
 
-    made = lines()
-    while batch := [*islice(made, _BATCH)]:
+    printed = lines()
+    while batch := [*islice(printed, _BATCH)]:
         count += len(batch)
         print("\n".join(batch), flush=True)
     if span is not None and not count:
@@ -186,19 +186,19 @@ def _explain(
         stops.take(entry)
         last = entry.at
     stops.note_answers(recording.about.get("obeyed", ""))
-    found = [stop for stop in stops.found if span is None or span[0] <= stop.at <= span[1]]
-    for number, stop in enumerate(found):
+    chosen = [stop for stop in stops.found if span is None or span[0] <= stop.at <= span[1]]
+    for number, stop in enumerate(chosen):
         if args.json:
             print(stop.json())
         else:
             print("\n".join(([""] if number else []) + stop.lines()))
-    for each in stops.silences:
-        if span is None or span[0] <= each.at <= span[1]:
-            silence = shown(each, wire)
-            print(silence.json(False) if args.json else silence.line(False))
-    if not found and span is not None:
+    for silence in stops.silences:
+        if span is None or span[0] <= silence.at <= span[1]:
+            as_shown = shown(silence, wire)
+            print(as_shown.json(False) if args.json else as_shown.line(False))
+    if not chosen and span is not None:
         _say_nothing(span, "no deadman tripped", last)
-    elif not found and not stops.has_actions:
+    elif not chosen and not stops.has_actions:
         say("this recording has no actions of the router: an earlier version made it, or nothing was sent")
-    elif not found:
+    elif not chosen:
         say("no deadman tripped in this recording")

@@ -36,8 +36,8 @@ def run(args: argparse.Namespace) -> int:
     url = running_url(args)
     received = None
     try:
-        *_, received, problems = found = health(url)
-        state, code = ("degraded", DEGRADED) if found.is_degraded else ("running", OK)
+        *_, received, problems = answer = health(url)
+        state, code = ("degraded", DEGRADED) if answer.is_degraded else ("running", OK)
     except TransportError as error:
         state, code, problems = "down", NETWORK_FAULT, (down(url, error),)
     if args.json:

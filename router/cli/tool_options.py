@@ -206,7 +206,7 @@ def print_batches(
     left, until = args.count, time.monotonic() + (args.seconds or math.inf) - waited
     for batch in batches:
         if shown := batch[:left]:
-            print("\n".join(each.json(args.hex) if args.json else each.line(args.hex) for each in shown), flush=True)
+            print("\n".join(item.json(args.hex) if args.json else item.line(args.hex) for item in shown), flush=True)
         if time.monotonic() >= until or (left is not None and (left := left - len(shown)) == 0):
             return
 
@@ -236,10 +236,10 @@ def speed(text: str) -> float:
 
 
 def _parse_factor(text: str) -> float:
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)x", text)
-    if found is None or not 0 < float(found[1]) <= 1e6:
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)x", text)
+    if match is None or not 0 < float(match[1]) <= 1e6:
         raise ValueError(f"'{text}' is not a speed such as 2x or 0.5x")
-    return float(found[1])
+    return float(match[1])
 
 
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")

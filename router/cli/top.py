@@ -83,8 +83,8 @@ def _look(url: str, interval: float) -> tuple[View, str]:
 
     before = metrics(url)
     time.sleep(interval)
-    after, found = metrics(url), health(url)
-    return view(before, after, found.problems), found.name
+    after, state = metrics(url), health(url)
+    return view(before, after, state.problems), state.name
 
 
 def _title(table: str, url: str) -> str:
@@ -104,17 +104,17 @@ def _show(url: str, order: Order, interval: float) -> None:
     from router.tools.top import Order, Window, view
     from router.tools.top_view import Screen, keys
 
-    console, orders = Console(), {each.key: each for each in Order}
+    console, orders = Console(), {choice.key: choice for choice in Order}
     window, note, first = Window(), "", 0
     window.add(metrics(url))
-    found = health(url)
+    state = health(url)
     with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    newest, found = metrics(url), health(url)
+                    newest, state = metrics(url), health(url)
                 except TransportError as error:
                     note = str(error)
                 else:
@@ -122,8 +122,8 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            seen = view(*window.ends, found.problems)
-            shown = Screen(seen, _title(found.name, url), order, console.height, note, first)
+            seen = view(*window.ends, state.problems)
+            shown = Screen(seen, _title(state.name, url), order, console.height, note, first)
             live.update(shown, refresh=True)
             try:
                 key = wait_for_key(max(due - time.monotonic(), 0.0))

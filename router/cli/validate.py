@@ -55,12 +55,12 @@ def find_tables(paths: Sequence[Path]) -> list[Path]:
             tables[path] = None
             continue
         try:
-            found = sorted(file for file in path.iterdir() if _is_table(file))
+            inside = sorted(file for file in path.iterdir() if _is_table(file))
         except OSError as error:
             raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
-        if not found:
+        if not inside:
             raise UsageError(f"the folder '{path}' has no route table (*.yaml, *.yml)")
-        tables.update(dict.fromkeys(found))
+        tables.update(dict.fromkeys(inside))
     return list(tables)
 
 

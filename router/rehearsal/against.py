@@ -70,19 +70,19 @@ class Against:
         self._unmatched: tuple[Counter[tuple[str, bytes]], ...] = (Counter(), Counter())
         """Deliveries that the other table has not made so far, by target and digest."""
 
-    def take(self, found: Recorded) -> None:
+    def take(self, datagram: Recorded) -> None:
         if not self._runs:
-            self._first, self._start = found.steady, found.at
-            self._runs = tuple(Rehearsal(program, found.at) for program in self._programs)
+            self._first, self._start = datagram.steady, datagram.at
+            self._runs = tuple(Rehearsal(program, datagram.at) for program in self._programs)
         self.datagrams += 1
-        self.span = found.steady - self._first
-        self.senders.add((found.endpoint, found.listener, found.peer))
+        self.span = datagram.steady - self._first
+        self.senders.add((datagram.endpoint, datagram.listener, datagram.peer))
         for run, program in zip(self._runs, self._programs, strict=True):
             run.advance(self._start + self.span)
-            if found.listener in program.table.listeners:
-                run.datagram(found.listener, found.peer, found.data)
+            if datagram.listener in program.table.listeners:
+                run.datagram(datagram.listener, datagram.peer, datagram.data)
             else:
-                run.events.append(Rejected(run.now, found.listener, "no such listener"))
+                run.events.append(Rejected(run.now, datagram.listener, "no such listener"))
         old, new = (self._deliveries(side) for side in (0, 1))
         for target in dict.fromkeys((*old, *new)):
             self._compare(old.get(target, []), new.get(target, []))
@@ -100,54 +100,54 @@ class Against:
 
     def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
         """Return deliveries since the last call, by target. Losses are counted."""
-        found: dict[str, list[Delivery]] = {}
+        deliveries: dict[str, list[Delivery]] = {}
         for event in self._runs[side].events:
             if isinstance(event, (Sent, Published)):
-                found.setdefault(event.target, []).append(event)
+                deliveries.setdefault(event.target, []).append(event)
             elif (loss := _loss(event)) is not None:
                 self.losses[side][loss] += 1
         self._runs[side].events.clear()
-        return found
+        return deliveries
 
     def _compare(self, old: Sequence[Delivery], new: Sequence[Delivery]) -> None:
         """Count what one target got from one datagram and in the time before it."""
-        for each in old:
-            self._row(each).old += 1
-        for each in new:
-            self._row(each).new += 1
-        only_old = self._without_same(old, Counter(each.data for each in new), count=True)
-        only_new = self._without_same(new, Counter(each.data for each in old), count=False)
+        for delivery in old:
+            self._row(delivery).old += 1
+        for delivery in new:
+            self._row(delivery).new += 1
+        only_old = self._without_same(old, Counter(delivery.data for delivery in new), count=True)
+        only_new = self._without_same(new, Counter(delivery.data for delivery in old), count=False)
         only_old = list(self._without_moved(only_old, self._unmatched[1]))
         only_new = list(self._without_moved(only_new, self._unmatched[0]))
         both = min(len(only_old), len(only_new))
         for before, after in zip(only_old[:both], only_new[:both], strict=True):
             self._row(after).changed += 1
             self._example(before, after)
-        for each in only_old[both:]:
-            self._unmatched[0][_key(each)] += 1
-            self._example(each, None)
-        for each in only_new[both:]:
-            self._unmatched[1][_key(each)] += 1
-            self._example(None, each)
+        for delivery in only_old[both:]:
+            self._unmatched[0][_key(delivery)] += 1
+            self._example(delivery, None)
+        for delivery in only_new[both:]:
+            self._unmatched[1][_key(delivery)] += 1
+            self._example(None, delivery)
 
-    def _without_same(self, found: Sequence[Delivery], others: Counter[bytes], *, count: bool) -> list[Delivery]:
+    def _without_same(self, deliveries: Sequence[Delivery], others: Counter[bytes], *, count: bool) -> list[Delivery]:
         left = []
-        for each in found:
-            if others[each.data]:
-                others[each.data] -= 1
-                self._row(each).same += count
+        for delivery in deliveries:
+            if others[delivery.data]:
+                others[delivery.data] -= 1
+                self._row(delivery).same += count
             else:
-                left.append(each)
+                left.append(delivery)
         return left
 
-    def _without_moved(self, found: Sequence[Delivery], unmatched: Counter[tuple[str, bytes]]) -> Iterator[Delivery]:
+    def _without_moved(self, left: Sequence[Delivery], unmatched: Counter[tuple[str, bytes]]) -> Iterator[Delivery]:
         """Yield deliveries without those that the other table made earlier."""
-        for each in found:
-            if unmatched[key := _key(each)]:
+        for delivery in left:
+            if unmatched[key := _key(delivery)]:
                 unmatched[key] -= 1
-                self._row(each).moved += 1
+                self._row(delivery).moved += 1
             else:
-                yield each
+                yield delivery
 
     def _row(self, event: Delivery) -> Row:
         return self.rows.setdefault((event.route, event.target), Row())
@@ -201,24 +201,24 @@ class Report:
         self._indexes = (TableIndex(old), TableIndex(new))
         self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
 
-    def lines(self, found: Against) -> Iterator[str]:
+    def lines(self, comparison: Against) -> Iterator[str]:
         """Yield the whole report; a short one if both tables deliver the same."""
         old, new = (checked.path for checked in self._tables)
-        yield f"{found.datagrams} datagrams of {found.span / 1e9:.1f} s, through {old} and {new}"
-        if not found.differs:
-            yield f"both deliver the same, {sum(row.old for row in found.rows.values())} datagrams and messages"
-            yield from _same_losses(found)
-            yield from _strangers(found)
+        yield f"{comparison.datagrams} datagrams of {comparison.span / 1e9:.1f} s, through {old} and {new}"
+        if not comparison.differs:
+            yield f"both deliver the same, {sum(row.old for row in comparison.rows.values())} datagrams and messages"
+            yield from _same_losses(comparison)
+            yield from _strangers(comparison)
             return
-        yield from _counts(found)
-        yield from _losses(found)
-        for (route, target), row in sorted(found.rows.items()):
+        yield from _counts(comparison)
+        yield from _losses(comparison)
+        for (route, target), row in sorted(comparison.rows.items()):
             for at, before, after in row.examples:
                 if _is_reported(row, before, after):
                     yield ""
                     yield f"{route} to {target}, {at / 1e9:.3f} s after the beginning:"
                     yield from self._example(before, after)
-        yield from _strangers(found)
+        yield from _strangers(comparison)
 
     def _example(self, before: Delivery | None, after: Delivery | None) -> Iterator[str]:
         if before is None or after is None:
@@ -255,8 +255,8 @@ class Report:
             return unread._replace(name=kind.name)
 
 
-def _counts(found: Against) -> Iterator[str]:
-    rows = {key: row for key, row in sorted(found.rows.items()) if row.differs}
+def _counts(comparison: Against) -> Iterator[str]:
+    rows = {key: row for key, row in sorted(comparison.rows.items()) if row.differs}
     if not rows:
         return
     width = [max(map(len, column)) for column in zip(("route", "target"), *rows, strict=True)]
@@ -267,8 +267,8 @@ def _counts(found: Against) -> Iterator[str]:
         yield f"{route:{width[0]}}  {target:{width[1]}}" + "".join(f"{count:9}" for count in counts)
 
 
-def _losses(found: Against) -> Iterator[str]:
-    old, new = found.losses
+def _losses(comparison: Against) -> Iterator[str]:
+    old, new = comparison.losses
     changed = sorted(loss for loss in {*old, *new} if old[loss] != new[loss])
     if changed:
         yield ""
@@ -278,20 +278,20 @@ def _losses(found: Against) -> Iterator[str]:
         yield f"{done} ({reason}): {place}{to}: {old[loss]} with the old table, {new[loss]} with the new one"
 
 
-def _same_losses(found: Against) -> Iterator[str]:
+def _same_losses(comparison: Against) -> Iterator[str]:
     """Yield what both tables lost: everything if the recording is from another network."""
     counts: Counter[str] = Counter()
-    for (done, _, _, reason), count in found.losses[0].items():
+    for (done, _, _, reason), count in comparison.losses[0].items():
         counts[f"{done} ({reason})"] += count
     for what, count in sorted(counts.items()):
         yield f"{what}: {count} with both"
 
 
-def _strangers(found: Against) -> Iterator[str]:
+def _strangers(comparison: Against) -> Iterator[str]:
     """Yield why almost nothing was delivered, if the tables are for a different network from the recording."""
-    if not found.is_among_strangers:
+    if not comparison.is_among_strangers:
         return
-    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in found.senders})
+    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in comparison.senders})
     more = f" and {len(named) - _MOST_SENDERS} more" if len(named) > _MOST_SENDERS else ""
     yield ""
     yield f"neither table has an endpoint for any sender of the recording: {', '.join(named[:_MOST_SENDERS])}{more};"

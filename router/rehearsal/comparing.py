@@ -127,9 +127,9 @@ class Comparison:
     def _differences(self, expected: Delivery, event: Sent | Published, outcome: Outcome) -> Iterator[Failure]:
         if isinstance(event, Published):
             if expected.fields is not None:
-                found = cdr.deserialize(expected.fields.type, event.data)
+                published = cdr.deserialize(expected.fields.type, event.data)
                 now = outcome.given_at(event.at)
-                for difference in expected.fields.differences((), expected.fields.type, found, now):
+                for difference in expected.fields.differences((), expected.fields.type, published, now):
                     yield self._different_field(difference, event)
         elif expected.is_unchanged:
             trims = self._table.endpoints[event.target].trim_trailing_zeros
@@ -204,7 +204,7 @@ class Comparison:
 
     def _of_name(self, target: str, outcome: Outcome) -> Related | None:
         """Return where in the table the delivery to a target is missing."""
-        return self._index.of_name(target, (each.route for each in outcome.events if isinstance(each, Received)))
+        return self._index.of_name(target, (event.route for event in outcome.events if isinstance(event, Received)))
 
 
 def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
@@ -219,8 +219,8 @@ def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failur
 def _routes(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
     taken = {event.route for event in events if isinstance(event, Received)}
     if expected.route is not None and taken != {expected.route.value}:
-        found = f"the route is {', '.join(sorted(taken))}" if taken else "no route takes it"
-        yield Failure(expected.route.span, f"{found}, not {expected.route.value}")
+        actual = f"the route is {', '.join(sorted(taken))}" if taken else "no route takes it"
+        yield Failure(expected.route.span, f"{actual}, not {expected.route.value}")
 
 
 def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:

@@ -161,9 +161,9 @@ def _keys(event: Event, expected: Expected) -> Iterator[Key]:
     match event:
         case Received():
             yield "route", event.route
-        case Sent() if any(each.is_compared for each in expected.sent.get(event.target, ())):
+        case Sent() if any(delivery.is_compared for delivery in expected.sent.get(event.target, ())):
             yield "deadman" if event.by_deadman else "target", event.route, event.target
-        case Published() if any(each.is_compared for each in expected.published.get(event.target, ())):
+        case Published() if any(delivery.is_compared for delivery in expected.published.get(event.target, ())):
             yield "target", event.route, event.target
         case Filtered() | Obeyed() | Disobeyed():
             yield type(event).__name__.lower(), event.route, event.target

@@ -56,25 +56,25 @@ class TableIndex:
                 self._targets.setdefault((route.route.name, target.label), []).append(target)
 
     def target(self, route: str, target: str, note: str = "the target") -> Related | None:
-        found = self._targets.get((route, target))
-        return Related(found[0].span, note) if found else None
+        targets = self._targets.get((route, target))
+        return Related(targets[0].span, note) if targets else None
 
     def type(self, route: str, topic: str) -> MessageType | None:
         """Return the type of a topic that a route publishes on."""
-        return next((found.type for found in self._targets.get((route, topic), ())), None)
+        return next((checked.type for checked in self._targets.get((route, topic), ())), None)
 
     def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
         """Return the target of this name in one of the `routes` that took a message, or else in any."""
         taken = [name for name in routes if name in self._routes]
-        found = next((found for name in taken if (found := self.target(name, target))), None)
-        if found is None and taken:
-            found = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
-        return found or next((self.target(*key) for key in self._targets if key[1] == target), None)
+        related = next((related for name in taken if (related := self.target(name, target))), None)
+        if related is None and taken:
+            related = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
+        return related or next((self.target(*key) for key in self._targets if key[1] == target), None)
 
     def condition(self, route: str, target: str) -> Related | None:
-        for found in self._targets.get((route, target), ()):
-            if found.when is not None:
-                return Related(found.when.span, "withheld by this condition")
+        for checked in self._targets.get((route, target), ()):
+            if checked.when is not None:
+                return Related(checked.when.span, "withheld by this condition")
         return self.target(route, target)
 
     def deadman(self, route: str) -> Related | None:
@@ -87,10 +87,10 @@ class TableIndex:
 
     def field(self, route: str, target: str, path: Path) -> Related | None:
         """Return what fills a field, or else the target that leaves it at its default."""
-        for found in self._targets.get((route, target), ()):
-            if found.plan is None:
-                return Related(found.span, "forwarded here")
-            if (span := _filled(found.plan, path)) is not None:
+        for checked in self._targets.get((route, target), ()):
+            if checked.plan is None:
+                return Related(checked.span, "forwarded here")
+            if (span := _filled(checked.plan, path)) is not None:
                 return Related(span, f"{path_text(path)} is filled here")
         return self.target(route, target, "nothing here fills it")
 
@@ -100,7 +100,7 @@ def _filled(plan: Plan, path: Path) -> SourceSpan | None:
         case Leaf() | Each():
             return plan.span
         case Record():
-            inner = next((made for field, made in plan.members if path and field.name == path[0]), None)
+            inner = next((member for field, member in plan.members if path and field.name == path[0]), None)
             if inner is None:
                 return plan.span if not path else None
             return _filled(inner, path[1:])

@@ -88,9 +88,9 @@ class Time:
         return now if self.offset is None else START + self.offset
 
     def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
-        expected, found = self.at(now), _time_of(self.type, actual)
-        if found != expected:
-            yield Difference(path, offset(expected - START), offset(found - START), self.span)
+        expected, stamp = self.at(now), _time_of(self.type, actual)
+        if stamp != expected:
+            yield Difference(path, offset(expected - START), offset(stamp - START), self.span)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +122,8 @@ class Elements:
     def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
         assert isinstance(kind, List)  # noqa: S101 - it was read as one
         if len(actual) != len(self.items):
-            found = f"{len(actual)} elements {shown(kind, actual)}" if len(actual) else "empty"
-            yield Difference(path, f"{len(self.items)} elements", found, self.span)
+            content = f"{len(actual)} elements {shown(kind, actual)}" if len(actual) else "empty"
+            yield Difference(path, f"{len(self.items)} elements", content, self.span)
             return
         for index, (item, value) in enumerate(zip(self.items, elements(kind, actual), strict=True)):
             yield from item.differences((*path, index), kind.element, value, now)
@@ -238,9 +238,9 @@ class FieldReader:
 
     def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
         """Return the value of a ROS constant of the message (`STATUS_FIX`), or of an enum (`GPSFixQuality.RTK_FIX`)."""
-        found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
-        if isinstance(found, int):
-            return found
+        constant = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
+        if isinstance(constant, int):
+            return constant
         numbers = self._constants.get(text, set())
         if len(numbers) > 1:
             message = f"several enums have a value '{text}', with different numbers"
@@ -260,15 +260,15 @@ def _refuse_other_type(kind: Type, node: ScalarNode) -> None:
 
 def _near(text: str, span: SourceSpan) -> Scalar | None:
     """Parse `~1.571`, any number that rounds to it, or `1.57 +- 0.01`, any number within that tolerance."""
-    if found := _ROUGHLY.fullmatch(text):
-        value = _finite(found[1], "number to be near", span)
-        digits = len(found[2] or "") - int(found[3] or 0)
+    if match := _ROUGHLY.fullmatch(text):
+        value = _finite(match[1], "number to be near", span)
+        digits = len(match[2] or "") - int(match[3] or 0)
         return Scalar(value, span, float(f"0.5e{-digits}"), text)
-    if found := _WITHIN.fullmatch(text):
-        value = _finite(found[1], "number to be near", span)
-        tolerance = _finite(found[2], "tolerance", span)
+    if match := _WITHIN.fullmatch(text):
+        value = _finite(match[1], "number to be near", span)
+        tolerance = _finite(match[2], "tolerance", span)
         if tolerance < 0:
-            raise InvalidValueError(span, Code.BAD_VALUE, f"the tolerance '{found[2]}' is negative")
+            raise InvalidValueError(span, Code.BAD_VALUE, f"the tolerance '{match[2]}' is negative")
         return Scalar(value, span, tolerance, text)
     return None
 

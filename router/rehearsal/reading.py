@@ -64,12 +64,12 @@ def find_test_files(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises if a parent folder is not readable)
             try:
-                found = sorted(
+                inside = sorted(
                     file for file in path.iterdir() if file.name.endswith(TEST_ENDINGS) and file.name[0] != "."
                 )
             except OSError as error:
                 raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
-            files.update(dict.fromkeys(found))
+            files.update(dict.fromkeys(inside))
         else:
             files[path] = None
     return list(files)
@@ -92,10 +92,10 @@ def read_test_file(path: Path, definitions: Definitions) -> TestFile:
     reader = _Reader(Names(checked, checked.program))
     tests = root.get("tests")
     assert isinstance(tests, MappingNode)  # noqa: S101 - the schema saw to it
-    found = tuple(reader.test(name, entry.key.span, entry.value) for name, entry in tests.entries.items())
+    read = tuple(reader.test(name, entry.key.span, entry.value) for name, entry in tests.entries.items())
     if reader.findings:
         raise TableError(reader.findings)
-    return TestFile(checked, checked.program, found)
+    return TestFile(checked, checked.program, read)
 
 
 def _table_of(root: MappingNode, path: Path) -> Path:
@@ -183,7 +183,7 @@ class _Reader:
             self._find(span, Code.MISSING_KEY, message, "write what it expects, or 'expect: nothing'")
             return Step(span, Expected(span))
         given = node.get("given")
-        expected = self._read(lambda found: self._expected.expected(expect.key.span, found, given), expect.value)
+        expected = self._read(lambda written: self._expected.expected(expect.key.span, written, given), expect.value)
         return Step(
             span=span,
             expected=expected or Expected(expect.key.span),
@@ -230,7 +230,7 @@ def _checked_nodes(path: Path) -> MappingNode:
     if not findings and is_valid(root):
         findings += _schema_findings(root, SourceSpan(source.file))
     if findings:
-        raise TableError(sorted(findings, key=lambda found: (found.span, found.message)))
+        raise TableError(sorted(findings, key=lambda finding: (finding.span, finding.message)))
     return root
 
 

@@ -83,7 +83,7 @@ def _run_step(step: Step, rehearsal: Rehearsal, program: Program) -> Outcome:
 
 def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, bytes]]:
     """Give a step's message to the rehearsal. Return the times and bytes of what was given."""
-    found: list[tuple[int, bytes]] = []
+    arrived: list[tuple[int, bytes]] = []
     begin = rehearsal.now
     for number in range(given.times):
         rehearsal.advance(begin + number * given.every)
@@ -94,8 +94,8 @@ def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, byt
         else:
             data = _datagram(given, wire, now)
             rehearsal.datagram(given.listener, given.peer, data, now - given.age)
-        found.append((now, data))
-    return found
+        arrived.append((now, data))
+    return arrived
 
 
 def _datagram(given: Given, wire: Wire, now: int) -> bytes:

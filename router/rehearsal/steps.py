@@ -172,7 +172,7 @@ class Names:
 
     def watched(self, name: str, span: SourceSpan) -> str:
         """Return an endpoint that shows whether it obeys a deadman."""
-        watched = [each for plan in self._program.deadmen if plan.obeyed for each in plan.obeyed.endpoints]
+        watched = [endpoint for plan in self._program.deadmen if plan.obeyed for endpoint in plan.obeyed.endpoints]
         return self._known(name, watched, span, "deadman with `obeyed` for the endpoint", Code.UNKNOWN_ENDPOINT)
 
     def route(self, name: str, span: SourceSpan) -> str:
@@ -199,8 +199,8 @@ class Names:
 
     @cached_property
     def _subscribed(self) -> Mapping[str, MessageType]:
-        subscriptions = [each for route in self._checked.routes for each in route.subscriptions]
-        return {each.topic.topic.value: each.type for each in subscriptions}
+        subscriptions = [subscription for route in self._checked.routes for subscription in route.subscriptions]
+        return {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
 
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)
@@ -359,12 +359,12 @@ class ExpectedReader:
         return Delivery(entry.key.span, case=case, fields=fields)
 
     def _published(self, node: Node | None, given: Node | None) -> Deliveries:
-        found: dict[str, tuple[Delivery, ...]] = {}
+        deliveries: dict[str, tuple[Delivery, ...]] = {}
         for name, entry in node.entries.items() if isinstance(node, MappingNode) else ():
             kind, span = self._names.published(name, entry.key.span), entry.key.span
             listed = _listed(entry.value)
-            found[name] = tuple(each for one in listed for each in self._messages(kind, span, one, given))
-        return found
+            deliveries[name] = tuple(delivery for one in listed for delivery in self._messages(kind, span, one, given))
+        return deliveries
 
     def _messages(self, kind: MessageType, span: SourceSpan, node: Node, given: Node | None) -> Sequence[Delivery]:
         times = 1
@@ -396,7 +396,7 @@ class ExpectedReader:
             return None
         node = entry.value
         if isinstance(node, MappingNode):
-            counts = {known(name, each.key.span): _count(each.value) for name, each in node.entries.items()}
+            counts = {known(name, counted.key.span): _count(counted.value) for name, counted in node.entries.items()}
             return Located(counts, entry.key.span)
         return Located(Counter(known(*_name(item)) for item in _listed(node)), entry.key.span)
 

@@ -77,13 +77,13 @@ def command_cases(table: RouteTable, board: str) -> frozenset[str]:
 def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[Stop]:
     """Return the payloads that the deadmen of a program send to this board."""
     return [
-        Stop(each.case.name, each.message, MISSED_REPEATS * plan.repeat / 1e9, text)
+        Stop(payload.case.name, payload.message, MISSED_REPEATS * plan.repeat / 1e9, text)
         for plan in deadmen
         for endpoint, datagrams in plan.datagrams
         if endpoint == board
         for payloads in [[*map(wire.decode, datagrams)]]
         for text in [", ".join(map(_described, payloads))]
-        for each in payloads
+        for payload in payloads
     ]
 
 
@@ -195,17 +195,17 @@ def boards(
     Raises UsageError if `obeys` names a board or a payload case to which nothing is sent.
     """
     plans = tuple(deadmen)
-    found = {}
+    by_name = {}
     for name, endpoint in table.endpoints.items():
         commands, stops = command_cases(table, name), stops_for(wire, plans, name)
         if endpoint.kind is EndpointKind.BOARD and (commands or stops):
-            found[name] = Board(name, commands, stops, changed, obeys.get(name))
+            by_name[name] = Board(name, commands, stops, changed, obeys.get(name))
             sent = commands | {stop.case for stop in stops}
             for case in sorted(set(obeys.get(name, ())) - sent):
                 raise UsageError(f"nothing sends '{case}' to {name}", did_you_mean(case, sent))
-    for name in obeys.keys() - found:
-        raise UsageError(f"no board that gets commands is called '{name}'", did_you_mean(name, found))
-    return found
+    for name in obeys.keys() - by_name:
+        raise UsageError(f"no board that gets commands is called '{name}'", did_you_mean(name, by_name))
+    return by_name
 
 
 PART = ("frame_id", "total_count", "index")

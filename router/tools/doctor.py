@@ -49,8 +49,8 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     running = _health(program)
     yield from carrier()
     yield from extras(program)
-    yield from (found := [*ros(program)])
-    if running is None and all(each.grade is Grade.FINE for each in found):
+    yield from (results := [*ros(program)])
+    if running is None and all(result.grade is Grade.FINE for result in results):
         yield from ros_peers(program)
     yield from listeners(program)
     yield from ports(program, running=running is not None)
@@ -86,10 +86,10 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
 
 def _table(checked: Checked) -> Iterator[CheckResult]:
     warnings = 0
-    for found in checked.diagnostics:
-        if found.severity is Severity.ERROR:
+    for finding in checked.diagnostics:
+        if finding.severity is Severity.ERROR:
             yield problem(
-                "table", f"{found.span}: {found.message}", found.hint or "run `router validate` to see the place"
+                "table", f"{finding.span}: {finding.message}", finding.hint or "run `router validate` to see the place"
             )
         else:
             warnings += 1
@@ -121,20 +121,20 @@ def _reported(program: Program, running: Health) -> Iterator[CheckResult]:
     """Yield what a running router reports; it may be running another version of the table."""
     if running.table_sha256 != program.table.sha256:
         yield warning("router", "its table differs from this file", "router reload, or systemctl restart")
-    for each in running.problems:
-        if each.kind.level is Level.CALM:
-            yield fine("router", each.text)
+    for reported in running.problems:
+        if reported.kind.level is Level.CALM:
+            yield fine("router", reported.text)
             continue
-        grade = problem if each.kind.level is Level.CRITICAL else warning
-        yield grade("router", each.text, f"{each.remedy} See {page(each.page)}")
-    if all(each.kind.level is Level.CALM for each in running.problems):
+        grade = problem if reported.kind.level is Level.CRITICAL else warning
+        yield grade("router", reported.text, f"{reported.remedy} See {page(reported.page)}")
+    if all(reported.kind.level is Level.CALM for reported in running.problems):
         yield fine("router", f"it runs and loses nothing; {plural(running.received, 'datagram')} received")
 
 
 def _in_place_of(running: Health | None) -> Mapping[str, str]:
     """Return, by endpoint, the other host that sends its payloads, as the running router reports."""
-    labels = [each.labels for each in running.problems] if running is not None else []
-    return {each["endpoint"]: each["sender"] for each in labels if "sender" in each}
+    reported = [cause.labels for cause in running.problems] if running is not None else []
+    return {labels["endpoint"]: labels["sender"] for labels in reported if "sender" in labels}
 
 
 def _health(program: Program) -> Health | None:

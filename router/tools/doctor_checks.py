@@ -179,7 +179,7 @@ def _clock_status() -> int | None:
 
 def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[CheckResult]:
     """Warn if several users run nodes: Fast DDS's shared memory silently loses messages between them."""
-    segments = [each for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")]
+    segments = [segment for segment in folder.glob("fastrtps_port*") if not segment.name.endswith("_el")]
     owners = {owner for owner in map(_owner, segments) if owner is not None}
     if len(owners) > 1 or (owners - {os.geteuid()} and variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4"):
         yield warning(
@@ -222,12 +222,12 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
         yield fine("ports", "the running router has them")
         return
     wanted: list[tuple[str, Address, str | None, str]] = []
-    wanted += [("tcp", found.value, None, what) for found, what in _pages(program) if found is not None]
+    wanted += [("tcp", address.value, None, what) for address, what in _pages(program) if address is not None]
     gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
     wanted += gateways
-    there = [each for each in program.listeners if _absence(each) is None] if with_listeners else []
-    wanted += [("udp", each.address.value, each.interface, f"listener '{each.name}'") for each in there]
-    refused = [finding for each in wanted for finding in _port(*each, waits=each in gateways)]
+    there = [listener for listener in program.listeners if _absence(listener) is None] if with_listeners else []
+    wanted += [("udp", listener.address.value, listener.interface, f"listener '{listener.name}'") for listener in there]
+    refused = [finding for port in wanted for finding in _port(*port, waits=port in gateways)]
     free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
@@ -236,8 +236,8 @@ def listeners(program: Program) -> Iterator[CheckResult]:
     """Check that the addresses of listeners, and the network interfaces that they name, are there and up."""
     for listener in program.listeners:
         about = f"listener '{listener.name}'"
-        if (found := _absence(listener)) is not None:
-            why, remedy = found
+        if (absent := _absence(listener)) is not None:
+            why, remedy = absent
             remedy += "; the router waits for it, for example for a tunnel to come up"
             yield warning("listeners", f"{about} cannot use {listener.bound_to}: {why}", remedy)
         elif listener.interface is not None and interface_is_up(listener.interface):
@@ -273,9 +273,9 @@ def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
         if gateway.address is not None and gateway.transport.value in (Transport.TCP, Transport.WEBSOCKET):
             yield "tcp", gateway.address.value, what
         for locator in gateway.zenoh.listen if gateway.zenoh is not None else ():
-            if (found := LOCATOR.fullmatch(locator)) and found["protocol"] == "tcp/":
+            if (match := LOCATOR.fullmatch(locator)) and match["protocol"] == "tcp/":
                 with suppress(BadAddressError):
-                    yield "tcp", parse_address(found["address"]), what
+                    yield "tcp", parse_address(match["address"]), what
 
 
 def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[CheckResult]:
@@ -319,12 +319,12 @@ def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Ite
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
         try:
-            found = why_unreachable(address)
+            unreachable = why_unreachable(address)
         except BadAddressError as error:
             yield problem("endpoints", f"{endpoint.name}: {error.what}", error.hint)
             continue
-        if found:
-            why, remedy = found
+        if unreachable:
+            why, remedy = unreachable
             yield grade("endpoints", f"{endpoint.name}: nothing can be sent to {address.host}: {why}", remedy)
 
 
@@ -334,7 +334,8 @@ def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[Chec
     `in_place_of`: by endpoint, another host that sends its payloads.
     """
     yield from ways(program, problem)
-    reachable = {each.name: each.address.value.host for each in program.table.endpoints.values() if _has_way(each)}
+    known = program.table.endpoints.values()
+    reachable = {endpoint.name: endpoint.address.value.host for endpoint in known if _has_way(endpoint)}
     try:
         answered = answering(set(reachable.values()))
     except PermissionError:
@@ -396,17 +397,17 @@ def _request(identity: int) -> bytes:
 
 
 def extras(program: Program) -> Iterator[CheckResult]:
-    for each in missing_extras(program.table):
-        yield problem("Python", each.what, each.hint)
+    for missing in missing_extras(program.table):
+        yield problem("Python", missing.what, missing.hint)
 
 
 def ros(program: Program) -> Iterator[CheckResult]:
     plans = (*program.publishers, *program.subscriptions)
     if not plans and not program.gateways:
         return
-    found = [problem("ROS", each.what, each.hint) for each in obstacles(os.environ)]
-    yield from found
-    if found:  # loading it would end this process
+    problems = [problem("ROS", obstacle.what, obstacle.hint) for obstacle in obstacles(os.environ)]
+    yield from problems
+    if problems:  # loading it would end this process
         return
     try:
         from router.ros.node import middleware
@@ -425,7 +426,7 @@ def ros(program: Program) -> Iterator[CheckResult]:
         more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
         yield problem("ROS", f"{first.what}{more}", first.hint or ros_package_remedy(package))
     unresolved = list(unresolved_peers(os.environ))
-    yield from (problem("ROS", each.what, each.hint) for each in unresolved)
+    yield from (problem("ROS", peer.what, peer.hint) for peer in unresolved)
     if not wrong and not unresolved:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         types = plural(len({plan.type_name for plan in plans}), "message type")
@@ -443,7 +444,7 @@ def ros_peers(program: Program) -> Iterator[CheckResult]:
     from router.ros.graph import look_once
 
     try:
-        found = look_once("router_doctor", program, DISCOVERY_S)
+        others = look_once("router_doctor", program, DISCOVERY_S)
     except StartError as error:
         yield problem("ROS", error.what, error.hint)
         return
@@ -454,18 +455,18 @@ def ros_peers(program: Program) -> Iterator[CheckResult]:
             "a",
             f"if it runs this table, add an `http.address`, so that doctor can ask it; if not, {remedy}",
         )
-    for router in sorted({each.router for each in found.shared}):
-        theirs = sorted(each for each in found.shared if each.router == router)
-        topics = [each.name for each in theirs if not each.is_node]
-        whats = ["has the name of its node"] if any(each.is_node for each in theirs) else []
+    for router in sorted({shared.router for shared in others.shared}):
+        theirs = sorted(shared for shared in others.shared if shared.router == router)
+        topics = [shared.name for shared in theirs if not shared.is_node]
+        whats = ["has the name of its node"] if any(shared.is_node for shared in theirs) else []
         if topics:
             whats.append(f"takes messages from {listed(topics)}")
         what = f"{which} router runs, process {router.process} on {router.host}: it {listed(whats)}"
         yield warning("ROS", what, remedy)
-    if found.namesakes:
+    if others.namesakes:
         name = program.table.node.name
         yield warning("ROS", f"another node is called {name}", "stop it, or give one of them another name")
-    for peer in found.mistyped:
+    for peer in others.mistyped:
         remedy = f"give that {peer.peer} the table's type, or stop it; `ros2 topic info -v {peer.topic}` names its node"
         yield warning("ROS", str(peer), remedy)
 

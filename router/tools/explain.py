@@ -435,9 +435,9 @@ def live_route(route: Route, mistyped: Sequence[Mistyped]) -> Iterator[str]:
     """Yield the peers that now have another type than a topic of the route."""
     used = {(topic.topic.value, PUBLISHER) for topic in route.source_topics}
     used |= {(topic.topic.value, SUBSCRIBER) for topic in route.topics}
-    if found := [each for each in mistyped if (each.topic, each.peer) in used]:
+    if wrong := [peer for peer in mistyped if (peer.topic, peer.peer) in used]:
         yield ""
-        yield from (f"  now: {each}" for each in found)
+        yield from (f"  now: {peer}" for peer in wrong)
 
 
 # Two tables
@@ -474,8 +474,8 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
         "record": table.record,
     }
     parts = {"table": _settings_lines(settings)}
-    parts |= {f"listener {name}": _settings_lines(each) for name, each in table.listeners.items()}
-    parts |= {f"endpoint {name}": _settings_lines(each) for name, each in table.endpoints.items()}
+    parts |= {f"listener {name}": _settings_lines(listener) for name, listener in table.listeners.items()}
+    parts |= {f"endpoint {name}": _settings_lines(endpoint) for name, endpoint in table.endpoints.items()}
     for route in checked.routes:
         parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
     for gateway in checked.gateways:

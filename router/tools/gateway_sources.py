@@ -280,12 +280,12 @@ class UdpSource:
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
         """Return everything that has arrived, to empty the receive buffer quickly."""
-        found: list[Arrival] = []
+        arrivals: list[Arrival] = []
         if self._readable.poll(timeout * 1000):
             with suppress(BlockingIOError):
-                while len(found) < _MOST_AT_ONCE:
-                    found.append(Arrival(*self._socket.recvfrom(LARGEST_DATAGRAM)))
-        return found
+                while len(arrivals) < _MOST_AT_ONCE:
+                    arrivals.append(Arrival(*self._socket.recvfrom(LARGEST_DATAGRAM)))
+        return arrivals
 
     def close(self) -> None:
         self._socket.close()

@@ -24,10 +24,10 @@ def needed_lengths(routes: Iterable[CheckedRoute]) -> dict[str, int]:
 
     Of needs that contradict each other, one is met.
     """
-    found = _Needs()
+    needs = _Needs()
     for checked in routes:
-        found.of_route(checked)
-    return {path: each.length for each in found.groups for path in each.paths}
+        needs.of_route(checked)
+    return {path: group.length for group in needs.groups for path in group.paths}
 
 
 @dataclass(slots=True)
@@ -95,11 +95,12 @@ class _Needs:
 
     def _combine(self, lists: Sequence[tuple[str, tree.Node]], exact: int = 0, most: int = sys.maxsize) -> None:
         self.variables |= {name: self._path(values) for name, values in lists}
-        self._add((each for _, values in lists for each in self._lists(values)), _Group(set(), most=most, exact=exact))
+        groups = (group for _, values in lists for group in self._lists(values))
+        self._add(groups, _Group(set(), most=most, exact=exact))
 
-    def _add(self, lists: Iterable[_Group], need: _Group) -> None:
-        for each in lists:
-            need.join(each)
+    def _add(self, groups: Iterable[_Group], need: _Group) -> None:
+        for group in groups:
+            need.join(group)
         apart = []
         for group in self.groups:
             if group.paths & need.paths:

@@ -68,7 +68,7 @@ def _layout(layout: Layout) -> Iterator[str]:
 def _fields(fields: list[WantedField], layout: Layout) -> Iterator[str]:
     """Yield the fields of a protobuf message that are read, and the slots that say which member of a oneof is set."""
     for field in fields:
-        places = [_slot(each, layout) for each in (field.slot, field.presence) if each != NONE]
+        places = [_slot(slot, layout) for slot in (field.slot, field.presence) if slot != NONE]
         places += [f"section {field.section}"] if field.section != NONE else []
         if places:
             repeated = "repeated " * field.is_repeated
@@ -116,7 +116,7 @@ def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) 
     yield ""
     yield f"  elements, {_stored(elements.scalar)}"
     yield from _listed(elements.routine, [place] * len(elements.routine), layout)
-    slots = [_slot(each, layout) for each in (elements.item, elements.index, elements.count) if each != NONE]
+    slots = [_slot(slot, layout) for slot in (elements.item, elements.index, elements.count) if slot != NONE]
     into = [f"section {elements.section}"] * (elements.section != NONE) + slots
     yield f"    each -> {', '.join(into)}" if into else "    each"
 
@@ -127,7 +127,7 @@ def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> 
         yield ""
         yield f"  {what}"
         yield from _listed(routine, [place] * len(routine), layout)
-    slots = [_slot(each, layout) for each in (collect.items, collect.counted) if each != NONE]
+    slots = [_slot(slot, layout) for slot in (collect.items, collect.counted) if slot != NONE]
     if slots:
         yield f"    all of a frame -> {', '.join(slots)}"
 

@@ -196,13 +196,13 @@ def _check_word(name: str, remedy: str) -> None:
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
     """Return the endpoint of this name, with or without `_board`."""
-    senders = {name: each for name, each in table.endpoints.items() if each.kind is not EndpointKind.TOOL}
-    found = senders.get(board) or senders.get(f"{board}_board")
-    if found is None:
+    senders = {name: endpoint for name, endpoint in table.endpoints.items() if endpoint.kind is not EndpointKind.TOOL}
+    endpoint = senders.get(board) or senders.get(f"{board}_board")
+    if endpoint is None:
         names = [name.removesuffix("_board") for name in senders]
         hint = did_you_mean(board, names) or f"the boards are {', '.join(names)}"
         raise UsageError(f"{table.path.name} has no board '{board}'", hint)
-    return found
+    return endpoint
 
 
 def _case(name: str, board: str) -> str:
@@ -264,5 +264,5 @@ def _is_free(number: int, site: Site) -> bool:
 def _promise(number: int, site: Site) -> str:
     """Return the comment in the envelope's file that promises the number, such as `Number 30 is promised to ...`."""
     text = (site.schema.root / site.file(site.envelope.name)).read_text(encoding="utf-8")
-    found = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
-    return found[1] if found else ""
+    promise = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
+    return promise[1] if promise else ""

@@ -109,9 +109,9 @@ def locked(site: Site) -> str:
     """Return the lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
     schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
     lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
-    errors = [each for each in lock.findings() if each.severity is Severity.ERROR]
+    errors = [finding for finding in lock.findings() if finding.severity is Severity.ERROR]
     if errors:
-        raise UsageError("; ".join(each.message for each in errors))
+        raise UsageError("; ".join(finding.message for finding in errors))
     return lock_text(lock.extended())
 
 
@@ -155,7 +155,7 @@ def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
     is_of_same_board = site.envelope.cases[last.name].type.short_name.startswith(message.prefix)
     lines[end + 1 : end + 1] = [own] if is_of_same_board else ["", f"{indent}// {message.board_words}", own]
 
-    imports = {index: found[1] for index, line in enumerate(lines) if (found := _IMPORT.match(line))}
+    imports = {index: match[1] for index, line in enumerate(lines) if (match := _IMPORT.match(line))}
     head = max((index for index, line in enumerate(lines) if _HEAD.match(line)), default=-1)
     new = site.new_file(message)
     place = next((index for index, name in imports.items() if name > new), max(imports, default=head) + 1)
@@ -235,9 +235,9 @@ def _entries(text: str, section: str) -> list[_Entry]:
     """Return the entries of a top-level mapping."""
     root = yaml.compose(text, yaml.SafeLoader)
     top = root.value if isinstance(root, yaml.MappingNode) else []
-    found = next((value for key, value in top if key.value == section), None)
+    mapping = next((value for key, value in top if key.value == section), None)
     lines, entries = text.split("\n"), []
-    for key, value in found.value if isinstance(found, yaml.MappingNode) else []:
+    for key, value in mapping.value if isinstance(mapping, yaml.MappingNode) else []:
         first = key.start_mark.line
         last = max(first, _last_line(value))
         while not lines[last].strip():
@@ -321,16 +321,16 @@ def _own_routes(table: RouteTable) -> list[Route]:
 
 def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
     line = max((route.case.span.line for route in routes), default=0)
-    found = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
-    if found is None:
+    last = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
+    if last is None:
         raise UsageError("the table has no routes of its own to add one to", "write the route by hand")
-    return found
+    return last
 
 
 def _basestations(message: NewMessage, table: RouteTable) -> list[str]:
     """Return the endpoints that get every message of a board."""
     endpoints = table.endpoints.items()
-    return [name for name, each in endpoints if each.kind is EndpointKind.BASESTATION and name != message.board]
+    return [name for name, endpoint in endpoints if endpoint.kind is EndpointKind.BASESTATION and name != message.board]
 
 
 def _in_tests(path: Path, message: NewMessage, site: Site) -> str:

@@ -55,13 +55,13 @@ class TapRecording:
         """Add a batch. Call this every second, also with an empty batch, so that earlier ones are written."""
         datagrams: list[MirroredDatagram] = []
         actions: list[Action] = []
-        for each in batch:
-            if isinstance(each, Lost):
-                self.missed += each.number
-            elif isinstance(each, Action):
-                actions.append(each)
+        for mirrored in batch:
+            if isinstance(mirrored, Lost):
+                self.missed += mirrored.number
+            elif isinstance(mirrored, Action):
+                actions.append(mirrored)
             else:
-                datagrams.append(each)
+                datagrams.append(mirrored)
         self.datagrams += len(datagrams)
         self._encoder.add(datagrams, self._classifier, time_ns(), monotonic_ns())
         self._encoder.add_actions(actions, self._classifier, time_ns(), monotonic_ns())
@@ -94,13 +94,13 @@ def on_time(recording: Recording, speed: float) -> Iterator[Recorded]:
     Changes of the wall clock during the recording have no effect.
     """
     start, first = 0.0, None
-    for found in recording.datagrams():
+    for datagram in recording.datagrams():
         if first is None:
-            start, first = time.monotonic(), found.steady  # not before: opening a large recording takes time
-        wait = start + (found.steady - first) / 1e9 / speed - time.monotonic()
+            start, first = time.monotonic(), datagram.steady  # not before: opening a large recording takes time
+        wait = start + (datagram.steady - first) / 1e9 / speed - time.monotonic()
         if wait > 0:
             time.sleep(wait)
-        yield found
+        yield datagram
 
 
 @dataclass(slots=True)
@@ -129,16 +129,16 @@ class Replayer:
         self._origin = origin
         self._sockets: dict[tuple[str, tuple[str, int], str], socket.socket] = {}
 
-    def send(self, found: Recorded) -> None:
+    def send(self, datagram: Recorded) -> None:
         """Send a datagram. Raises UsageError if its listener has no address, TransportError if sending fails."""
-        key = (found.listener, found.peer, found.endpoint)
+        key = (datagram.listener, datagram.peer, datagram.endpoint)
         if key not in self._sockets:
             if len(self._sockets) >= MOST_SOCKETS:
                 self.close()
-            self._sockets[key] = self._open(found)
+            self._sockets[key] = self._open(datagram)
         sender = self._sockets[key]
         try:
-            self.resent.refused += udp.send_once(sender, found.data)
+            self.resent.refused += udp.send_once(sender, datagram.data)
         except OSError as error:
             raise udp.cannot_send(Address(*sender.getpeername()), error) from error
         self.resent.datagrams += 1
@@ -150,8 +150,8 @@ class Replayer:
             sender.close()
         self._sockets.clear()
 
-    def _open(self, found: Recorded) -> socket.socket:
-        to, sender = self._destination(found.listener), self._bound(found)
+    def _open(self, datagram: Recorded) -> socket.socket:
+        to, sender = self._destination(datagram.listener), self._bound(datagram)
         try:
             udp.connect(sender, to)
         except TransportError:
@@ -168,16 +168,16 @@ class Replayer:
             raise UsageError(f"the table does not have the listener '{listener}' of the recording", hint or "give --to")
         return udp.listener_address(listeners[listener])
 
-    def _bound(self, found: Recorded) -> socket.socket:
+    def _bound(self, datagram: Recorded) -> socket.socket:
         if self._origin is not None:
             return udp.open_udp(self._origin, "--from")
-        wanted = Address(*found.peer)
-        if self._table is not None and found.endpoint in self._table.endpoints:
-            wanted = udp.origin(found.endpoint, self._table)
+        wanted = Address(*datagram.peer)
+        if self._table is not None and datagram.endpoint in self._table.endpoints:
+            wanted = udp.origin(datagram.endpoint, self._table)
         for address in (wanted, wanted._replace(port=0)):
             try:
-                return udp.open_udp(address, found.endpoint)
+                return udp.open_udp(address, datagram.endpoint)
             except UsageError:
                 continue
-        self.resent.elsewhere[found.endpoint or f"{found.peer[0]}:{found.peer[1]}"] = wanted.host
+        self.resent.elsewhere[datagram.endpoint or f"{datagram.peer[0]}:{datagram.peer[1]}"] = wanted.host
         return udp.open_udp(udp.ANYWHERE, "replay")

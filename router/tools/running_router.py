@@ -86,20 +86,20 @@ def metrics(url: str) -> Snapshot:
     text, headers = _got(url, "/metrics")
     try:
         at = float(headers.get(COLLECTED_AT) or time.monotonic())
-        found = parse_metrics(text.decode(errors="replace"), at)
+        snapshot = parse_metrics(text.decode(errors="replace"), at)
     except (ValueError, KeyError) as error:
         raise TransportError(f"what answers at {url}/metrics is not a router") from error
-    if not found.values:
+    if not snapshot.values:
         raise TransportError(f"what answers at {url}/metrics is not a router: it does not have a router's metrics")
-    return found
+    return snapshot
 
 
 def health(url: str) -> Health:
     """Return what is wrong with a running router. Raises TransportError as `metrics` does."""
     text, _ = _got(url, "/health.json")
     try:
-        found = json.loads(text)
-        return Health(found["name"], found["table"], found["received"], tuple(map(Problem.of, found["problems"])))
+        answer = json.loads(text)
+        return Health(answer["name"], answer["table"], answer["received"], tuple(map(Problem.of, answer["problems"])))
     except (ValueError, LookupError, TypeError) as error:
         raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 

@@ -57,10 +57,10 @@ class Silence:
 
 def parse_silence(text: str) -> Silence:
     """Parse `basestation:5-8`, or `manual_drive:5-` without an end. Raises UsageError for other text."""
-    found = _SILENCE.fullmatch(text)
-    if found is None:
+    match = _SILENCE.fullmatch(text)
+    if match is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
-    silence = Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+    silence = Silence(match["name"], float(match["start"]), float(match["end"] or "inf"))
     if silence.end <= silence.start:
         raise UsageError(f"'{text}' ends before it begins")
     return silence
@@ -76,10 +76,10 @@ def parse_obedience(texts: Iterable[str]) -> dict[str, frozenset[str]]:
     """
     obeys: dict[str, frozenset[str]] = {}
     for text in texts:
-        found = _OBEDIENCE.fullmatch(text)
-        if found is None:
+        match = _OBEDIENCE.fullmatch(text)
+        if match is None:
             raise UsageError(f"'{text}' is not NAME:CASE, such as driving_board:manual_drive,drive_motor")
-        obeys[found["board"]] = obeys.get(found["board"], frozenset()) | set(found["cases"].split(","))
+        obeys[match["board"]] = obeys.get(match["board"], frozenset()) | set(match["cases"].split(","))
     return obeys
 
 

@@ -100,10 +100,10 @@ class Stop:
             f"  cause     {cause}",
             *([f"  remedy    {remedy}"] if remedy else []),
             f"  last fed  {self._last_fed()}",
-            *(f"  lost      {each}" for each in self.lost),
-            *(f"  sent      {each}" for each in self._sent()),
-            *(f"  board     {self._board(each)}" for each in self.settings.brakes),
-            *(f"  obeyed    {each}" for each in self.obeyed),
+            *(f"  lost      {loss}" for loss in self.lost),
+            *(f"  sent      {brake}" for brake in self._sent()),
+            *(f"  board     {self._board(board)}" for board in self.settings.brakes),
+            *(f"  obeyed    {answer}" for answer in self.obeyed),
             f"  released  {self._release()}",
         ]
 
@@ -123,14 +123,14 @@ class Stop:
                 else {"time": utc_text(local_time(fed.at)), "case": fed.case, "sender": fed.sender},
                 "lost": [
                     {
-                        "decision": each.decision,
-                        "reason": each.reason,
-                        "case": each.case,
-                        "sender": each.sender,
-                        "count": each.count,
-                        "detail": each.detail,
+                        "decision": loss.decision,
+                        "reason": loss.reason,
+                        "case": loss.case,
+                        "sender": loss.sender,
+                        "count": loss.count,
+                        "detail": loss.detail,
                     }
-                    for each in self.lost
+                    for loss in self.lost
                 ],
                 "sent": [
                     {"case": case, "endpoint": endpoint, "problem": problem, "count": count}
@@ -164,7 +164,7 @@ class Stop:
         if self._topic:
             return f"no client published on {self._topic}", "Check that the client runs and reaches the gateway."
         if self.lost:
-            worst = max(self.lost, key=lambda each: each.count)
+            worst = max(self.lost, key=lambda loss: loss.count)
             silent = [self._silence(source) for source in sources if not worst.is_own and self._is_silent(source)]
             return "; ".join((worst.words, *silent)), REMEDIES.get(worst.reason, "")
         if self.settings.is_from_ros:

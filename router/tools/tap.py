@@ -56,7 +56,7 @@ class Condition:
                 findings[case.name] = error.diagnostic
         if not self._conditions:
             # The hint closest to what was written.
-            likely = max(findings.values(), key=lambda each: SequenceMatcher(a=each.hint, b=text).ratio())
+            likely = max(findings.values(), key=lambda finding: SequenceMatcher(a=finding.hint, b=text).ratio())
             raise UsageError(f"--where: {likely.message}", likely.hint)
 
     @property
@@ -88,16 +88,16 @@ def _checked(text: str, message: MessageType) -> Node:
 def _enums(message: MessageType) -> Iterator[Enum]:
     """Return the enum types of all fields of a message and of the messages in it, each once."""
     waiting: list[Type] = [message]
-    found: dict[str, Type] = {}
+    types: dict[str, Type] = {}
     while waiting:
         current = waiting.pop()
         if isinstance(current, List):
             waiting.append(current.element)
-        elif isinstance(current, (Enum, MessageType)) and current.name not in found:
-            found[current.name] = current
+        elif isinstance(current, (Enum, MessageType)) and current.name not in types:
+            types[current.name] = current
             if isinstance(current, MessageType):
                 waiting += [member.type for member in current.fields]
-    return (each for each in found.values() if isinstance(each, Enum))
+    return (kind for kind in types.values() if isinstance(kind, Enum))
 
 
 PATIENCE = 0.2
@@ -273,11 +273,11 @@ class RunningTap:
     ) -> Iterator[list[TappedDatagram | ShownAction]]:
         """Yield the part of each batch that is to be shown, which may be empty."""
         for batch in batches:
-            self.missed += sum(each.number for each in batch if isinstance(each, Lost))
-            found = [each for each in batch if not isinstance(each, Lost)]
-            found.sort(key=lambda each: each.at)  # actions come apart from datagrams
-            made = [(shown(each, self._wire), each.at) for each in found]
-            yield [as_shown for as_shown, at in made if self._filter.takes(as_shown, at)]
+            self.missed += sum(item.number for item in batch if isinstance(item, Lost))
+            mirrored = [item for item in batch if not isinstance(item, Lost)]
+            mirrored.sort(key=lambda item: item.at)  # actions come apart from datagrams
+            items = [(shown(item, self._wire), item.at) for item in mirrored]
+            yield [item for item, at in items if self._filter.takes(item, at)]
 
 
 def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:

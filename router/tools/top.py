@@ -186,8 +186,8 @@ def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
 def _has(problems: Sequence[Problem], kind: Kind, route: str = "", **labels: str) -> bool:
     """Return whether a problem of this kind has these labels and concerns the route."""
     return any(
-        each.kind is kind and labels.items() <= each.labels.items() and (not route or route in each.routes)
-        for each in problems
+        problem.kind is kind and labels.items() <= problem.labels.items() and (not route or route in problem.routes)
+        for problem in problems
     )
 
 

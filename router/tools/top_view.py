@@ -156,7 +156,7 @@ def _summary(view: View, width: int, problem_lines: int, endpoint_lines: int) ->
 
 def _problems(view: View, width: int, most: int) -> list[Text]:
     """Return the problems below each other, wrapped at words; those that do not fit are counted."""
-    told = [*(("!", each) for each in view.problems), *(("□", each) for each in view.calm)]
+    told = [*(("!", text) for text in view.problems), *(("□", text) for text in view.calm)]
     lines = [
         (number, sign, line)
         for number, (sign, text) in enumerate(told, 1)

@@ -134,10 +134,10 @@ def _not_a_place(text: str, table: RouteTable | None, form: str) -> UsageError:
 
 def _resolve(host: str) -> str:
     try:
-        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+        addresses = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
     except OSError as error:
         raise UsageError(f"no IPv4 address for '{host}': {error.strerror}") from error
-    return str(found[0][4][0])
+    return str(addresses[0][4][0])
 
 
 def _port(text: str, lowest: int) -> int:

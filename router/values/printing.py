@@ -168,8 +168,8 @@ def elements(kind: List, value: Any) -> Sequence[Any]:
     """Return the elements of a list; for a protobuf map, its entries sorted by key."""
     if kind.entry is not None:  # its own order differs from run to run
         return [Entry(key, value[key]) for key in sorted(_readable(value))]
-    found: Sequence[Any] = value
-    return found
+    listed: Sequence[Any] = value
+    return listed
 
 
 def _readable(keys: Iterable[Any]) -> Iterator[Any]:
