@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.errors import MappingError
-from router.types.model import Bool, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Float, Int, List, MessageType, String, Type, zero
 
 HEADER = b"\x00\x01\x00\x00"
 """Representation identifier CDR_LE and two option bytes."""
@@ -113,19 +113,7 @@ def known_default(declared: Type, default: Any) -> Iterator[Known]:
             for value in values:
                 yield from known_default(declared.element, value)
         case _:
-            yield known_value(_zero(declared) if default is None else default, declared)
-
-
-def _zero(declared: Type) -> object:
-    match declared:
-        case Bool():
-            return False
-        case Float():
-            return 0.0
-        case String():
-            return ""
-        case _:
-            return 0
+            yield known_value(zero(declared) if default is None else default, declared)
 
 
 # sizes
@@ -153,7 +141,7 @@ def _sizes(plan: Plan) -> Iterator[tuple[int, int, bool]]:  # noqa: C901 - one c
         case Leaf(type=String(wide=wide)) if plan.constant is None:
             yield 4, 4 if wide else 5, False
         case Leaf():
-            data, alignment = known_value(_zero(plan.type) if plan.constant is None else plan.constant, plan.type)
+            data, alignment = known_value(zero(plan.type) if plan.constant is None else plan.constant, plan.type)
             yield alignment, len(data), True
         case Items():
             if plan.type.length is None:

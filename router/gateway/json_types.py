@@ -8,7 +8,7 @@ import math
 from collections import defaultdict
 from typing import Any
 
-from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Field, Int, List, MessageType, String, Type, default_of
 
 PLACEHOLDER = Field("structure_needs_at_least_one_member", Int(8, signed=False))
 """The field that rosidl gives a message without fields."""
@@ -87,21 +87,15 @@ def _type_name(element: Type) -> str:
 
 def example(message: MessageType) -> dict[str, object]:
     """Return a message in plain style with all fields at their declared defaults."""
-    return {field.name: _default(field.type, field.default) for field in message.fields}
+    return {name: _in_json(value) for name, value in default_of(message).items()}
 
 
-def _default(declared: Type, default: Any) -> object:
-    match declared:
-        case MessageType():
-            return example(declared)
-        case List():
-            values = [None] * (declared.length or 0) if default is None else default
-            return [_default(declared.element, value) for value in values]
-        case Bool():
-            return bool(default)
-        case String():
-            return default or ""
-        case Float():
-            return default if default is not None and math.isfinite(default) else 0.0  # JSON has no infinity
-        case _:
-            return default or 0
+def _in_json(value: Any) -> object:
+    match value:
+        case dict():
+            return {name: _in_json(member) for name, member in value.items()}
+        case list() | tuple():
+            return [_in_json(element) for element in value]
+        case float() if not math.isfinite(value):
+            return 0.0  # JSON has no infinity
+    return value

@@ -22,9 +22,9 @@ from router.table.compose import resolve
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
-from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type, default_of
 from router.values.printing import elements, scalar_text
-from router.values.reading import filled, member, parse, zero
+from router.values.reading import filled, member, parse
 
 ANY = "any"
 RECEIVED_AT = "received_at"
@@ -317,10 +317,10 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
     match value:
         case Fields():
             given = {name: _plain(member, now, complete=complete) for name, member in value.members.items()}
-            return {**_default_of(value.type), **given} if complete else given
+            return {**default_of(value.type), **given} if complete else given
         case Elements(items=(Fields(type=MessageType(is_map_entry=True, fields=(key, member))), *_)):
-            absent = {} if isinstance(member.type, MessageType) else _default_of(member.type)
-            empty = {"key": _default_of(key.type), "value": absent}
+            absent = {} if isinstance(member.type, MessageType) else default_of(member.type)
+            empty = {"key": default_of(key.type), "value": absent}
             entries_given = (empty | _plain(entry, now, complete=False) for entry in value.items)
             return {entry["key"]: entry["value"] for entry in entries_given}
         case Elements():
@@ -333,22 +333,10 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
     raise AssertionError(f"{value} cannot be given")
 
 
-def _default_of(kind: Type, default: object = None) -> Any:
-    """Return the value of an unset field; for a message, its values by name. `default` is the declared one."""
-    if default is not None:
-        return default
-    match kind:
-        case MessageType():
-            return {field.name: _default_of(field.type, field.default) for field in kind.fields}
-        case List():
-            return [_default_of(kind.element) for _ in range(kind.length or 0)]
-    return zero(kind)
-
-
 def _is_unset(holder: Any, field: Field, value: Any) -> bool:
     if isinstance(holder, Message) and (field.has_presence or isinstance(field.type, MessageType)):
         return not holder.HasField(field.name)
-    return _is_default(field.type, value, _default_of(field.type, field.default))
+    return _is_default(field.type, value, default_of(field.type, field.default))
 
 
 def _is_default(kind: Type, value: Any, default: Any) -> bool:

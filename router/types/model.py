@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Union
+from typing import Any, Union
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,3 +155,22 @@ class MessageType:
 
 
 Type = Union[Bool, Int, Float, String, Bytes, Enum, List, MessageType]
+
+_ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Float: 0.0, String: "", Bytes: b""}
+
+
+def zero(kind: Type) -> object:
+    """Return the value of a scalar that is not set; of an enum, its first value."""
+    return kind.values[0][1] if isinstance(kind, Enum) else _ZEROS[type(kind)]
+
+
+def default_of(kind: Type, declared: object = None) -> Any:
+    """Return the value of an unset field, whose declared default may be given; of a message, its values by name."""
+    if declared is not None:
+        return declared
+    match kind:
+        case MessageType():
+            return {field.name: default_of(field.type, field.default) for field in kind.fields}
+        case List():
+            return [default_of(kind.element) for _ in range(kind.length or 0)]
+    return zero(kind)

@@ -14,7 +14,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 from router.errors import UsageError, did_you_mean
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type, zero
 from router.types.protobuf import PayloadCase
 
 # Messages
@@ -197,14 +197,6 @@ def _check_room(kind: List, count: int, path: str) -> None:
 
 
 # Scalars
-
-
-_ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Float: 0.0, String: "", Bytes: b""}
-
-
-def zero(kind: Type) -> object:
-    """Return the value of a scalar that is not set; of an enum, its first value."""
-    return kind.values[0][1] if isinstance(kind, Enum) else _ZEROS[type(kind)]
 
 
 _TRUTH = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
