@@ -93,8 +93,14 @@ def _assign(members: dict[str, Any], kind: MessageType, path: str, text: str) ->
     if not isinstance(inner, MessageType):
         holder[key] = _parse(inner, text, path)
     elif text:
-        example = f"{path}.{inner.fields[0].name if inner.fields else 'x'}=..."
-        raise UsageError(f"{path} is the message {inner}", f"set its fields, such as {example}")
+        raise UsageError(f"{path} is the message {inner}", f"set its fields, such as {path}{_first_field(inner)}=...")
+
+
+def _first_field(kind: Type) -> str:
+    """Return what names a field of a message in an example: `.x`; "" for a scalar."""
+    if not isinstance(kind, MessageType):
+        return ""
+    return f".{kind.fields[0].name}" if kind.fields else ".x"
 
 
 def _parse(kind: Type, text: str, path: str) -> object:
@@ -136,8 +142,8 @@ def _check_element(kind: List, path: str, text: str) -> None:
         raise UsageError(f"{path} is a map", f"name a value, such as {path}[key]=...")
     is_message = isinstance(kind.element, MessageType)
     if (is_message and text) or (not isinstance(kind.element, (String, Bytes)) and re.search(r"^\[|,", text)):
-        inner = f".{kind.element.fields[0].name}" if isinstance(kind.element, MessageType) else ""
-        hint = f"write each element: {path}[0]{inner}=... {path}[1]{inner}=..."
+        example = _first_field(kind.element)
+        hint = f"write each element: {path}[0]{example}=... {path}[1]{example}=..."
         raise UsageError(f"{path} is a list, {kind}, and '{text}' is no element of it", hint)
 
 

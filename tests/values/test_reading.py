@@ -193,6 +193,15 @@ def test_a_wrong_word_for_a_map_or_a_closed_enum_is_explained(case: PayloadCase,
     assert str(caught.value) == complaint
 
 
+def test_a_message_without_fields_has_an_example_too(tmp_path: Path) -> None:
+    (tmp_path / "kinds.proto").write_text(
+        'syntax = "proto3"; message Nothing {} message Kind { repeated Nothing nothings = 1; }'
+        "message PBEnvelope { oneof payload { Kind kind = 1; } }"
+    )
+    with pytest.raises(UsageError, match="nothings is a list, Nothing"):
+        build(wire_of_protos(tmp_path).case("kind"), "nothings=3")
+
+
 def test_the_last_member_of_a_oneof_is_set() -> None:
     message = build(PLAIN, "chosen_text=a", "chosen_motor.speed=1", "chosen_flag=yes", "chosen_text=b")
     assert compact(message, PLAIN.type) == "chosen_text=b"
