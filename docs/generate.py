@@ -31,7 +31,7 @@ from router.compiler.metrics import (
 )
 from router.errors import Code
 from router.rehearsal.reading import SCHEMA as TEST_SCHEMA
-from router.table.schema import table_schema
+from router.table.grammar import table_schema
 from tests.bad_tables.corpus import HERE as CORPUS
 from tests.bad_tables.corpus import BadTable, good, sections
 
@@ -96,6 +96,11 @@ a flood may be over when its last line appears; metrics are up to date."""
 _DURATION = """\
 `router_route_duration_seconds` ends when a datagram has been forwarded and queued for the thread that publishes it on
 topics; for a message from ROS, when all targets are served. Its upper bounds, in microseconds:"""
+
+
+def schema() -> str:
+    """The schema of a table, from the declarations of its keys."""
+    return json.dumps(table_schema(), indent=2) + "\n"
 
 
 def keys_page() -> str:
@@ -223,6 +228,7 @@ def readme() -> str:
 
 
 PAGES = {
+    "../schemas/route-table.schema.json": schema,
     "reference/keys.md": keys_page,
     "reference/test-keys.md": test_keys_page,
     "reference/commands.md": commands_page,

@@ -37,7 +37,7 @@ def imported(script: str) -> set[str]:
         ("from router.log import logger, FloodLog; FloodLog()", LOG),
         ("import router.net.sockets", {*LOG, *NET}),
         (
-            "from router.library import library; import router.carrier.forwarding_threads, router.carrier.sender; library()",
+            "from router.library import library; from router.carrier import forwarding_threads, sender; library()",
             {
                 "router.carrier", "router.library", "router.carrier.ring", "router.carrier.threads",
                 "router.carrier.forwarding_threads", "router.carrier.sender", *GROUND, *NET,

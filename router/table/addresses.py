@@ -82,8 +82,8 @@ def parse_local(text: str) -> Address:
     return address
 
 
-REMOTE = Quantity(parse_remote, str)
-LOCAL = Quantity(parse_local, str)
+REMOTE = Quantity("address", parse_remote, str)
+LOCAL = Quantity("address", parse_local, str)
 
 
 def _first(address: Address) -> int:

@@ -1,11 +1,12 @@
 """Keys of a table. Each is declared once, as a field of a class in `model`.
 
-The field's name, type and default are those of the key. Marks in `Annotated` add the rest:
+The field's name, type and default are those of the key. Marks in `Annotated` add to the type, and a docstring after the
+field describes the key:
 
     max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
 
-A `Quantity` parses and prints a number with a unit; `Named` and `Words` are below. `build` reads objects according to
-these declarations, `flat` and `phrases` print them.
+A `Quantity` parses and prints a number with a unit; the other marks are below. `build` reads objects according to these
+declarations, `flat` and `phrases` print them, and `grammar` makes the schema of them.
 """
 
 from __future__ import annotations
@@ -14,22 +15,49 @@ import enum
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from router.errors import Located, SourceSpan
 from router.table.nodes import TextPlace
 from router.table.units import Quantity
 
+T = TypeVar("T")
 
-@dataclass(frozen=True, slots=True)
-class Named:
+
+class Named(str):
     """The name of a key whose field is named differently. Dots separate nested keys."""
 
-    name: str
+    __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
+class Shape(str):
+    """Which values fit, if the type does not say it: a definition of `grammar.values`."""
+
+    __slots__ = ()
+
+
+class OneOf(str):
+    """The words that fit, with spaces between them."""
+
+    __slots__ = ()
+
+
+class Range(NamedTuple):
+    """The smallest and the largest whole number that fit."""
+
+    least: int
+    most: int
+
+
+class Listed(NamedTuple):
+    """How long a list is at least, whether its items differ, and whether one item may be `alone`, without a list."""
+
+    least: int = 0
+    unique: bool = False
+    alone: bool = False
+
+
+class Words(NamedTuple):
     """A phrase with `{}` for the key's value; used only if the key `beside` is also set."""
 
     text: str
@@ -47,7 +75,12 @@ class Key:
     is_located: bool
     quantity: Quantity | None
     words: Words | None
+    marks: Mapping[type, Any]
     default: Any
+
+    def mark(self, kind: Callable[..., T]) -> T | None:
+        """Return the mark of this class, None if there is none."""
+        return self.marks.get(kind)
 
     def text(self, value: Any) -> str:
         """Return the value as it is written in a table."""
@@ -91,13 +124,14 @@ def _key(field: Field[Any], hint: Any) -> Key:
     if is_located := get_origin(hint) is Located:
         (hint,) = get_args(hint)
     return Key(
-        name=marks[Named].name if Named in marks else field.name,
+        name=marks.get(Named, field.name),
         attribute=field.name,
         type=hint,
         is_list=is_list,
         is_located=is_located,
         quantity=marks.get(Quantity),
         words=marks.get(Words),
+        marks=marks,
         default=None if field.default is MISSING else field.default,
     )
 

@@ -14,12 +14,12 @@ from fractions import Fraction
 from typing import Any
 
 _QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+(?:/s)?)")
-_NANOSECONDS = {
+NANOSECONDS = {
     "ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "min": 60 * 10**9, "h": 3600 * 10**9,
 }  # fmt: skip
-_BYTES = {"B": 1, "kB": 1000, "KiB": 1 << 10, "MB": 10**6, "MiB": 1 << 20}
-_DISK_BYTES = {**_BYTES, "GB": 10**9, "GiB": 1 << 30}
-_BYTES_PER_SECOND = {f"{unit}/s": size for unit, size in _BYTES.items()}
+BYTES = {"B": 1, "kB": 1000, "KiB": 1 << 10, "MB": 10**6, "MiB": 1 << 20}
+DISK_BYTES = {**BYTES, "GB": 10**9, "GiB": 1 << 30}
+_BYTES_PER_SECOND = {f"{unit}/s": size for unit, size in BYTES.items()}
 _HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
 
 MAX_DURATION = (1 << 63) - 1
@@ -63,8 +63,12 @@ _MAX_DECIMALS = 15
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """The syntax of a kind of number: `parse` reads a scalar's value, `show` prints it."""
+    """The syntax of a kind of number: `parse` reads a scalar's value, `show` prints it.
 
+    `shape` is the definition of the values that fit, in `grammar.values`.
+    """
+
+    shape: str
     parse: Callable[[Any], Any]
     show: Callable[[Any], str]
 
@@ -111,7 +115,7 @@ def _meanings(text: str) -> Iterator[str]:
         return
     parts = [(number.replace(",", "."), unit.lower()) for number, unit in re.findall(_PART, text, re.IGNORECASE)]
     if len(parts) > 1:
-        units = [next((_NANOSECONDS[unit] for _, unit in _units(word) if unit in _NANOSECONDS), 0) for _, word in parts]
+        units = [next((NANOSECONDS[unit] for _, unit in _units(word) if unit in NANOSECONDS), 0) for _, word in parts]
         if all(units):
             times = zip(parts, units, strict=True)
             yield duration(int(sum(Fraction(number) * unit for (number, _), unit in times)))
@@ -121,8 +125,8 @@ def _meanings(text: str) -> Iterator[str]:
         amount = Fraction(number) * factor
         is_kept = factor == 1 and number[0] != "." and "e" not in number.lower()
         yield f"{number if is_kept else f'{float(amount):.15g}'}{' ' * (unit == 'Hz')}{unit}"
-        if unit in _NANOSECONDS and amount:
-            yield f"{float(10**9 / (amount * _NANOSECONDS[unit])):.6g} Hz"
+        if unit in NANOSECONDS and amount:
+            yield f"{float(10**9 / (amount * NANOSECONDS[unit])):.6g} Hz"
         if unit == "Hz" and amount:
             yield duration(round(10**9 / amount))
 
@@ -132,7 +136,7 @@ def _units(written: str) -> list[tuple[Fraction | int, str]]:
     for word in (written, written.removesuffix("s")):
         found = [_CONVERTED[word]] if word in _CONVERTED else []
         found += [(1, unit) for unit, spellings in _SPELLINGS.items() if word in spellings]
-        sizes = [unit for unit in _DISK_BYTES if word.removesuffix("/s") in _SPELLINGS[unit]]
+        sizes = [unit for unit in DISK_BYTES if word.removesuffix("/s") in _SPELLINGS[unit]]
         if found := [*found, *((1, f"{unit}{end}") for unit in sizes for end in ("", "/s"))]:
             return found
     return []
@@ -140,7 +144,7 @@ def _units(written: str) -> list[tuple[Fraction | int, str]]:
 
 def parse_duration(text: str) -> int:
     """Parse `500ms` as nanoseconds."""
-    return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
+    return _exact(text, NANOSECONDS, "nanoseconds", MAX_DURATION)
 
 
 def parse_period(text: str) -> int:
@@ -230,35 +234,36 @@ def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
     return f"{hertz:.{_MAX_DECIMALS}f} Hz"
 
 
-def _or(word: str, quantity: Quantity, instead: int | None = 0) -> Quantity:
+def _or(shape: str, word: str, quantity: Quantity, instead: int | None = 0) -> Quantity:
     """Return the quantity with an additional word, which is parsed as `instead`."""
     return Quantity(
+        shape,
         lambda text: instead if text == word else quantity.parse(text),
         lambda value: quantity.show(value) if value else word,
     )
 
 
-def _bytes(units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> Quantity:
+def _bytes(shape: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> Quantity:
     """Return a quantity of bytes, printed in the largest unit that gives a whole number."""
 
     def show(count: int) -> str:
         unit = next(unit for unit in reversed([*units]) if count % units[unit] == 0)
         return f"{count // units[unit]} {unit}"
 
-    return Quantity(lambda text: _exact(text, units, base, largest, smallest), show)
+    return Quantity(shape, lambda text: _exact(text, units, base, largest, smallest), show)
 
 
-DURATION = Quantity(parse_duration, duration)
-PATIENCE = _or(NEVER, DURATION, instead=None)
-PERIOD = _or(EACH, Quantity(parse_period, duration))
-INTERVAL = Quantity(parse_interval, duration)
-RATE = Quantity(parse_rate, rate)
-TOPIC_RATE = _or(EACH, Quantity(parse_topic_rate, topic_rate))
-SIZE = _bytes(_BYTES, "bytes", MAX_SIZE)
+DURATION = Quantity("duration", parse_duration, duration)
+PATIENCE = _or("patience", NEVER, DURATION, instead=None)
+PERIOD = _or("period", EACH, Quantity("duration", parse_period, duration))
+INTERVAL = Quantity("duration", parse_interval, duration)
+RATE = Quantity("rate", parse_rate, rate)
+TOPIC_RATE = _or("topic_rate", EACH, Quantity("rate", parse_topic_rate, topic_rate))
+SIZE = _bytes("size", BYTES, "bytes", MAX_SIZE)
 """Size of a buffer."""
-DATAGRAM_SIZE = _bytes(_BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
-MESSAGE_SIZE = _bytes(_BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
+DATAGRAM_SIZE = _bytes("size", BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
+MESSAGE_SIZE = _bytes("size", BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
 """Size of one message as text."""
-DISK_SIZE = _bytes(_DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
+DISK_SIZE = _bytes("disk_size", DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
 """Size of files."""
-DATA_RATE = _bytes(_BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)
+DATA_RATE = _bytes("data_rate", _BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)

@@ -6,25 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import jsonschema
-import pytest
 
-from router.table.keys import keys_of
-from router.table.model import (
-    Collect,
-    Deadman,
-    Destination,
-    Endpoint,
-    Gateway,
-    Inbound,
-    InboundDeadman,
-    Listener,
-    NodeSettings,
-    Qos,
-    RecordSettings,
-    Route,
-    Topic,
-    ZenohSettings,
-)
 from router.table.schema import table_schema
 
 
@@ -65,56 +47,20 @@ def test_mappings_with_known_keys_refuse_others() -> None:
     assert all(schema["additionalProperties"] is False for schema in [table_schema(), *closed])
 
 
-MODELS: list[tuple[str, type, set[str]]] = [
-    ("listener", Listener, set()),
-    ("endpoint", Endpoint, set()),
-    ("destination", Destination, set()),
-    ("topic", Topic, set()),
-    ("qos", Qos, set()),
-    ("route", Route, {"case", "no_deadman", "no_ttl", "source_topics"}),
-    ("deadman", Deadman, set()),
-    ("collect", Collect, set()),
-    ("gateway", Gateway, {"address", "zenoh"}),
-    ("zenoh", ZenohSettings, set()),
-    ("inbound", Inbound, {"topic", "no_ttl"}),
-    ("inbound_deadman", InboundDeadman, set()),
-]
-"""Definitions, the classes that declare their keys, and which of the fields are no keys of their own."""
-WITHIN = {("deadman", "none"), ("gateway", "ignore"), ("route", "topic")}
-"""Keys that are read with the mapping that they stand in."""
+def parts(schema: object) -> Iterator[dict[str, Any]]:
+    """Every schema within a schema, and other mappings."""
+    members = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
+    yield from ([schema] if isinstance(schema, dict) else [])
+    for member in members:
+        yield from parts(member)
 
 
-def properties(definition: str) -> dict[str, Any]:
-    """What a mapping may have; of the kinds of a part the one that is a mapping."""
-    schema = table_schema()["definitions"][definition]
-    found = next(part["properties"] for part in (schema, schema.get("then", {}), schema.get("else", {}))
-                 if "properties" in part)  # fmt: skip
-    return dict(found)
+def test_references_lead_to_definitions_and_all_are_used() -> None:
+    used = {part["$ref"].removeprefix("#/definitions/") for part in parts(table_schema()) if "$ref" in part}
+    assert used == {*table_schema()["definitions"]}
 
 
-@pytest.mark.parametrize(("definition", "model", "others"), MODELS)
-def test_the_model_declares_the_keys_of_the_schema(definition: str, model: type, others: set[str]) -> None:
-    declared = {key.name.partition(".")[0] for key in keys_of(model) if key.attribute not in others | {"name"}}
-    inherited = {key.name for key in keys_of(Topic)} if model is Inbound else set()
-    known = {name for name in properties(definition) if (definition, name) not in WITHIN}
-    assert (declared - known, known - declared - inherited) == (set(), set())
-
-
-def test_documented_defaults_are_those_of_the_model() -> None:
-    named = [(model, properties(definition)) for definition, model, _ in MODELS]
-    top = table_schema()["properties"]
-    compared = 0
-    for model, known in [
-        *named,
-        (RecordSettings, top["record"]["properties"]),
-        (NodeSettings, top["node"]["properties"]),
-    ]:
-        for key in keys_of(model):
-            outer, _, inner = key.name.partition(".")
-            declared = resolved(known.get(outer, {}))
-            documented = resolved(declared.get("properties", {}).get(inner, {}) if inner else declared).get("default")
-            if documented not in (None, [], {}) and key.default is not None:
-                assert key.text(key.default).replace(" ", "").lower() == str(documented).lower(), (model, key.name)
-                compared += 1
-    assert compared > 20
-    assert top["node"]["default"] == {"name": NodeSettings().name, "namespace": NodeSettings().namespace}
+def test_a_message_is_beside_the_keyword_that_it_is_about() -> None:
+    having = [part for part in parts(table_schema()) if "errorMessage" in part]
+    assert len(having) > 50
+    assert [part for part in having if not part.keys() & {"type", "pattern", "enum", "minProperties"}] == []

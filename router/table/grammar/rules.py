@@ -1,0 +1,153 @@
+"""The rules about several keys of one mapping, and the keys that are required."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from router.table.build import DEFAULT_FORMATS
+from router.table.grammar.keys import Schema, key, ref, required
+from router.table.model import Collect, Endpoint, Listener, RecordSettings, Transport, ZenohSettings
+
+
+def without(names: str, message: str) -> Schema:
+    """Return the schema of a mapping that has none of the keys `names`, a pattern. `message` is about one of them."""
+    return {"propertyNames": {"pattern": f"^(?!(?:{names})$)", "errorMessage": message}}
+
+
+def alone(name: str) -> Schema:
+    """Return the rule that a key has no other keys beside it."""
+    others = {"pattern": f"^{name}$", "errorMessage": f"is not allowed with '{name}'"}
+    return {"if": {"required": [name]}, "then": {"propertyNames": others}}
+
+
+def _has(**values: Schema) -> Schema:
+    """Return the schema of a mapping that has these keys, with such values."""
+    return {"required": [*values], "properties": values}
+
+
+def _over(transport: str) -> Schema:
+    """Return the schema of a gateway with this transport."""
+    return _has(transport={"type": "object", "required": [transport], "maxProperties": 1})
+
+
+def _each(schema: Schema) -> Schema:
+    return {"additionalProperties": schema}
+
+
+# -- required keys
+
+_IS_JSON: Schema = {"anyOf": [
+    _has(format={"enum": ["json", "json_lines"]}),
+    {**_over("websocket"), "not": {"required": ["format"]}},
+]}  # fmt: skip
+COMPLETE: Schema = {
+    "complete": {
+        "$comment": "The keys that are required once a table is merged with all that it extends. Lists replace, so the "
+        "items of a list must be complete.",
+        "required": ["version"],
+        "if": {
+            "required": ["gateways"],
+            "properties": {"gateways": {"minProperties": 1}, "listen": False, "routes": False},
+        },
+        "else": {"required": ["envelope", "listen", "routes"]},
+        "properties": {
+            "envelope": {"required": ["message", "oneof"]},
+            "http": {"required": ["address"]},
+            "record": {"required": required(RecordSettings)},
+            "foxglove": {"required": ["address"]},
+            "listen": _each({"required": required(Listener)}),
+            "endpoints": _each({"required": required(Endpoint)}),
+            "routes": _each(ref("complete_route")),
+            "gateways": _each(ref("complete_gateway")),
+        },
+    },
+    "complete_route": {
+        "if": {"required": ["ignore"]},
+        "else": {
+            "required": ["source"],
+            "properties": {
+                "deadman": {"if": {"required": ["none"]}, "else": {"required": ["send"]}},
+                "collect": {"required": required(Collect)},
+            },
+        },
+    },
+    "complete_gateway": {
+        "if": {"required": ["ignore"]},
+        "else": {
+            "required": ["transport"],
+            "properties": {"transport": {"properties": {"zenoh": {"required": required(ZenohSettings)}}}},
+            "allOf": [
+                {
+                    "if": {"allOf": [_over("udp"), _has(inbound={"type": "array", "minItems": 1})]},
+                    "then": {"required": ["receive"]},
+                },
+                {
+                    "if": _has(format={"const": "gateway_v2"}),
+                    "else": without(
+                        "max_datagram",
+                        "limits the datagrams of 'format: gateway_v2'; other formats have one packet per datagram",
+                    ),
+                },
+                {
+                    "if": _IS_JSON,
+                    "then": without("compression", "is for packets; the 'format' here is JSON documents"),
+                },
+            ],
+        },
+    },
+}
+
+# -- of targets and routes
+
+LIMIT: Schema = {
+    "if": {"required": ["max_rate"]},
+    "else": without("on_limit", "needs 'max_rate', which is missing here"),
+}
+ROUTE: Sequence[Schema] = [
+    {
+        "if": {"required": ["topic"]},
+        "then": without("topics", "is not allowed with 'topic'; write all topics under 'topics'"),
+    },
+    {
+        "if": _has(source={"anyOf": [{"type": "object"}, {"type": "array", "contains": {"type": "object"}}]}),
+        "then": {"allOf": [
+            without("collect", "joins datagrams; it is not allowed if the source is a topic"),
+            without("topics?", "publishes, but messages from a topic go to 'destinations'"),
+        ]},
+        "else": {"allOf": [
+            without("fields", "belongs in a topic here; a route has it only if its source is a topic"),
+            without("for_each", "splits a ROS message; it is allowed only if the source is a topic"),
+        ]},
+    },
+]  # fmt: skip
+
+# -- of gateways
+
+_NO_RECEIVE = without(
+    "receive", "is the local address of a udp gateway; over other transports clients send on their connection"
+)
+_NO_CLIENTS = without(
+    "max_clients|max_clients_per_host|from", "limits connections, so it is allowed with tcp and websocket only"
+)
+_PACKETS = {"gateway_v1": "one packet per message, with a binary header"}
+_FORMATS: Mapping[str, Mapping[str, str]] = {
+    "udp": {**_PACKETS, "gateway_v2": "packets in batches"},
+    "tcp": {**_PACKETS, "json_lines": "one document per line"},
+    "websocket": {"json": "documents", **_PACKETS},
+    "zenoh": {**_PACKETS, "json": "documents"},
+}
+_LIMITS = {"udp": [_NO_CLIENTS], "tcp": [_NO_RECEIVE], "websocket": [_NO_RECEIVE], "zenoh": [_NO_RECEIVE, _NO_CLIENTS]}
+
+
+def _of_transport(name: str, formats: Mapping[str, str]) -> Schema:
+    """Return the rule for gateways with a transport: which formats fit, and which keys do not."""
+    default = DEFAULT_FORMATS[Transport(name)].value
+    meanings = "; ".join(f"{each}: {meaning}" for each, meaning in formats.items())
+    chosen = key(
+        "Format", f"The format that clients read. {meanings}.", {"default": default, "enum": [*formats]},
+        must=f"be {' or '.join(map(repr, formats))} over {name}",
+    )  # fmt: skip
+    return {"if": _over(name), "then": {"allOf": [{"properties": {"format": chosen}}, *_LIMITS[name]]}}
+
+
+GATEWAY: Sequence[Schema] = [_of_transport(name, formats) for name, formats in _FORMATS.items()]
