@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from router.carrier.image import image_of
 from router.compiler import check, check_table
 from router.errors import Code
-from router.library import library
+from router.image.writer import write_image
 from tests.bad_tables.corpus import HERE
 from tests.tables import ROUTES
 
@@ -113,4 +112,4 @@ if __name__ == "__main__":
         plain([checked.diagnostics, [*program.counters.series()], program.lowered, program.inbound, program.outbound])
     )
     print(plain([program.senders, program.publishers, program.subscriptions, program.deadmen, program.boards]))
-    print(*image_of(library(), program))
+    print(*sorted(write_image(program).parts().items()))
