@@ -43,12 +43,12 @@ class ImageSaver:
         except OSError as error:
             self._failed(error)
         except Exception as error:  # noqa: BLE001 - a bug, which is logged: the router runs all the same
-            fault(error, "prevented it from saving the startup image").log()
+            fault(error, "prevented it from keeping the compiled program").log()
         else:
             self._stored = read
 
     def _failed(self, error: Exception) -> None:
         """Log the first failure."""
         if not self._has_failed:
-            logger.warning("the startup image is not saved: the next start takes longer", why=str(error))
+            logger.warning("the compiled program is not kept: the next start takes longer", why=str(error))
         self._has_failed = True

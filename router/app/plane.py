@@ -54,13 +54,13 @@ class Images:
 
     def __init__(self, forwarding: Forwarding, head_start: HeadStart | None) -> None:
         self._forwarding = forwarding
-        self._head_start = head_start
+        self._sent = head_start.sent if head_start is not None else {}
         self._generations = count(FIRST_GENERATION + 1)
 
     # adoption of another program
 
     def prepare(self, change: Change) -> None:
-        """Load the image. That of the first program has its deadmen send, unless they did so in a head start.
+        """Load the image. Deadmen of the first program send, unless they did so in a head start.
 
         This needs only sockets, so it does not wait for ROS, which takes longer to open. Raises MemoryError.
         """
@@ -69,8 +69,9 @@ class Images:
         change.image = self._forwarding.load(image, change.sockets.senders, next(self._generations), change.before)
         change.image.bind_listeners(change.sockets.listeners)
         if change.is_first:
+            has_sent = [*change.before.deadmen.values()] if change.before is not None else []
             for route, deadman in change.image.deadmen.items():
-                sent = self._head_start.sent.get(route) if self._head_start else deadman.start(boottime_ns())
+                sent = self._sent.get(route) if deadman in has_sent else deadman.start(boottime_ns())
                 if sent:
                     logger.info("the deadman has sent its payload at startup", route=route, to=sent)
 
@@ -88,7 +89,7 @@ class Images:
             for deadman in change.before.deadmen.values():
                 if deadman not in kept:
                     deadman.end()
-        change.before = self._head_start = None
+        change.before = None
         if change.image is not None:
             change.image.forget_before()
 

@@ -404,10 +404,10 @@ def test_a_service_managers_sockets_serve_another_table_after_the_head_start(rov
         port = rover.site.endpoints["driving_board"].getsockname()[1]
         rover.table.write_text(rover.table.read_text().replace(f":{port}", f":{other.getsockname()[1]}"))
         gate.unlink()
+        manager.hear("READY=1")
         assert other.recv(1000) == BRAKE
         rover.drive()
         assert after_brakes(other) == DRIVE
-        manager.hear("READY=1")
         assert rover.site.waiting() == {"driving_board": [BRAKE]}
 
 

@@ -280,7 +280,7 @@ def test_a_program_for_which_there_is_no_thread_is_not_kept_and_ends_nothing(
     monkeypatch.setattr(threads, "Thread", NoThread)
     with capture_logs() as logged, Router(site.program(ROUTE), saver=saver) as router:
         assert router.reload().ok
-    why = [(entry["log_level"], entry["why"]) for entry in logged if "is not saved" in entry["event"]]
+    why = [(entry["log_level"], entry["why"]) for entry in logged if "is not kept" in entry["event"]]
     assert why == [("warning", "can't start new thread")]
 
 
