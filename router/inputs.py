@@ -1,9 +1,9 @@
-"""The inputs of a compile: files, folders, links and variables. An open recording notes each with its value.
+"""The inputs of a compile: files, folders, links and variables. An open recording notes each as it is read.
 
 A compile reads its inputs only through the functions here. If descriptors or memory have run out, they raise
-StartError, so that this is not taken for a mistake in a file. A kept program is used if all of its inputs still have
-the same values (`changed`). A start checks them before it imports large modules, so this module imports only small
-ones.
+StartError, so that this is not taken for a mistake in a file. A kept program is used if none of its inputs has changed
+(`changed`). A file with the same inode, size and times is unchanged, as for git; where these cannot tell, its content
+is compared by a digest. A start does that before it imports large modules, so this module imports only small ones.
 """
 
 from __future__ import annotations
@@ -12,17 +12,22 @@ import os
 import stat
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from time import time_ns
+from zlib import crc32
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
     from typing import TypeAlias
 
-    Plain: TypeAlias = tuple[tuple[str, str, object], ...]
-    """(kind, name, value) of each input, sorted. If the value cannot be read, it is the errno."""
+    Value: TypeAlias = tuple[object, ...]
+    Stamp: TypeAlias = tuple[int, ...]
+    """Size, times (ns) and inode of a file."""
+    Plain: TypeAlias = tuple[tuple[str, str, Value, Stamp | None], ...]
+    """(kind, name, value, stamp) of each input, sorted. The stamp is None if it may miss a change."""
     Listing: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
     """The folders and the other files in a folder, sorted."""
 
@@ -33,7 +38,10 @@ _SCHEMAS = [os.path.join(place, "schemas") for place in (os.path.join(_PACKAGE, 
 _ABSENT = frozenset({2, 9, 20, 40})  # ENOENT, EBADF, ENOTDIR, ELOOP
 _CODE = (".py", ".so", ".json", ".html", ".xml")
 _OF_ROS = ("AMENT_", "RMW_", "ROS_")
-_UNSTEADY = "changed while it was read"
+_UNSTEADY = ("changed while it was read",)
+_SECOND = 1_000_000_000
+_TICK = 2 * _SECOND
+"""Time (ns) within which two writes may leave the same times: far more than a tick of a kernel or a file server."""
 _HAS_FOLDER_OF_COMMAND = not (sys.flags.isolated or getattr(sys.flags, "safe_path", False))
 """Whether `sys.path` starts with the command's folder, which depends on how the command was started."""
 
@@ -42,40 +50,39 @@ class Inputs:
     """The inputs that were read, with their values."""
 
     def __init__(self) -> None:
-        self._values: dict[tuple[str, str], object] = {}
+        self._noted: dict[tuple[str, str], tuple[Value, Stamp | None]] = {}
         try:
             self._folder = os.getcwd()
         except FileNotFoundError:  # the folder was deleted: no relative path can be resolved
             self._folder = ""
 
     def plain(self) -> Plain:
-        """Return all inputs as plain values for `marshal`. Compiles that read the same inputs get equal values."""
-        return tuple((kind, name, value) for (kind, name), value in sorted(self._values.items(), key=_key))
+        """Return all inputs as plain values for `marshal`."""
+        return tuple((*key, *self._noted[key]) for key in sorted(self._noted))
 
-    def note(self, kind: str, name: str, value: object) -> None:
-        """Note a value. An input whose value changed during the recording is noted with one that never matches."""
-        if kind in _OF_FILES:
+    def note(self, kind: str, name: str, *value: object, stamp: Stamp | None = None) -> None:
+        """Note a value, or more of one that was noted before. If it has changed, note one that never matches."""
+        if kind in ("file", "folder", "link"):
             name = os.path.join(self._folder, name)
-        before = self._values.setdefault((kind, name), value)
-        if before != value:
-            self._values[kind, name] = _UNSTEADY
+        before, earlier = self._noted.get((kind, name), ((), None))
+        shorter, longer = sorted((before, value), key=len)
+        if longer[: len(shorter)] == shorter:
+            self._noted[kind, name] = longer, stamp or earlier
+        else:
+            self._noted[kind, name] = _UNSTEADY, None
 
     def add(self, other: Inputs) -> None:
         """Add all inputs of `other`."""
-        for (kind, name), value in other._values.items():
-            self.note(kind, name, value)
+        for (kind, name), (value, stamp) in other._noted.items():
+            self.note(kind, name, *value, stamp=stamp)
 
     def read_again(self) -> bool:
-        """Read all inputs again. Return whether no value has changed; if so, note them in the open recording."""
-        if any(_PROBES[kind](name) != value for (kind, name), value in self._values.items()):
+        """Return whether no input has changed. If so, note all of them in the open recording."""
+        if changed(self.plain()):
             return False
         if (outer := _open.get()) is not None:
             outer.add(self)
         return True
-
-
-def _key(item: tuple[tuple[str, str], object]) -> tuple[str, str]:
-    return item[0]
 
 
 _open: ContextVar[Inputs | None] = ContextVar("inputs", default=None)
@@ -106,24 +113,31 @@ def recording(before: Inputs | None = None) -> Iterator[Inputs]:
 
 
 def changed(plain: Plain) -> str:
-    """Return the first input whose value has changed, in words; "" if none has."""
-    for kind, name, value in plain:
-        if _PROBES[kind](name) != value:
-            return _WORDS[kind].format(name)
+    """Return the first input that has changed, in words; "" if none has."""
+    for kind, name, value, stamp in plain:
+        if (stamp is None or stamp != _stamp(name)) and _value(kind, name, is_read=len(value) > 1) != value:
+            return name if kind == "process" else f"the {kind} {name}"
     return ""
+
+
+def are_same(one: Plain, other: Plain) -> bool:
+    """Return whether two compiles read the same, whenever the files were written."""
+    return [item[:-1] for item in one] == [item[:-1] for item in other]
 
 
 def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
     """Return the content of a file, or its first `most` bytes. Raises OSError, or ValueError for an impossible path."""
     name = os.fspath(path)
+    now = time_ns()
     try:
         with open(name, "rb") as stream:
+            stamp = _stamp(stream.fileno())  # before the content, which is then at least as new
             content = stream.read(most)
     except OSError as error:
         _check_shortage(error)
-        _note("file", name, error.errno)
+        _note("file", name, *(("",) if error.errno in _ABSENT else ("file", error.errno)))
         raise
-    _note("file", name, content)
+    _note("file", name, "file", _digest(content), stamp=stamp if stamp and _is_settled(stamp, now) else None)
     return content
 
 
@@ -147,26 +161,28 @@ def exists(path: str | os.PathLike[str]) -> bool:
     return _noted_kind(path) != ""
 
 
-def _noted_kind(path: str | os.PathLike[str]) -> str:
+def _noted_kind(path: str | os.PathLike[str]) -> object:
     name = os.fspath(path)
-    kind = _kind(name)
-    error = OSError(kind, os.strerror(kind), name) if isinstance(kind, int) else None
-    if error is not None:
+    (kind,) = _look(name, is_read=False)
+    _note("file", name, kind)
+    if isinstance(kind, int):
+        error = OSError(kind, os.strerror(kind), name)
         _check_shortage(error)
-    _note("kind", name, kind)
-    if error is not None:
         raise error
-    return str(kind)
+    return kind
 
 
 def listing(path: str | os.PathLike[str]) -> Listing:
     """Return the folders and the other files in a folder, without hidden ones. Empty if it cannot be read."""
     name = os.fspath(path)
-    found = _listing(name)
-    if isinstance(found, int):
-        _check_shortage(OSError(found, os.strerror(found), name))
-    _note("folder", name, found)
-    return ((), ()) if isinstance(found, int) else found
+    try:
+        found = _listing(name)
+    except OSError as error:
+        _check_shortage(error)
+        _note("folder", name, error.errno)
+        return (), ()
+    _note("folder", name, *found)
+    return found
 
 
 def _check_shortage(error: OSError) -> None:
@@ -188,7 +204,7 @@ def real_path(path: str | os.PathLike[str]) -> str:
 
 
 class _Environment(Mapping[str, str]):
-    """The environment variables of the process. Notes each one that is read."""
+    """The environment variables of the process. Notes each one whose value is read."""
 
     def __getitem__(self, name: str) -> str:
         value = os.environ.get(name)
@@ -198,9 +214,8 @@ class _Environment(Mapping[str, str]):
         return value
 
     def __iter__(self) -> Iterator[str]:
-        names = tuple(sorted(os.environ))
-        _note("names", "", names)
-        return iter(names)
+        """Yield all names. They are not noted: only the hints of errors need them, and then no program is kept."""
+        return iter(sorted(os.environ))
 
     def __len__(self) -> int:
         return len(os.environ)
@@ -209,45 +224,74 @@ class _Environment(Mapping[str, str]):
 ENVIRONMENT = _Environment()
 
 
-def _note(kind: str, name: str, value: object) -> None:
+def _note(kind: str, name: str, *value: object, stamp: Stamp | None = None) -> None:
     inputs = _open.get()
     if inputs is not None:
-        inputs.note(kind, name, value)
+        inputs.note(kind, name, *value, stamp=stamp)
 
 
-def _content(path: str) -> bytes | int | None:
-    """Return the content of a file, or errno; None unless it is a regular file, as reading others may block."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+def _value(kind: str, name: str, *, is_read: bool) -> Value:
+    if kind == "file":
+        return _look(name, is_read=is_read)
+    if kind == "folder":
         try:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                return None
-            with open(descriptor, "rb", buffering=0, closefd=False) as stream:
-                return stream.read()
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        return error.errno
+            return _listing(name)
+        except OSError as error:
+            return (error.errno,)
+    if kind == "link":
+        return (os.path.realpath(name),)
+    return (os.environ.get(name) if kind == "variable" else _process().get(name),)
 
 
-def _kind(path: str) -> str | int:
+def _look(path: str, *, is_read: bool) -> Value:
+    """Return what is there: "file", "folder", "other" or "" (nothing); an errno if that is unknown.
+
+    If a file is read, a digest of its content follows, or an errno.
+    """
     try:
         mode = os.stat(path).st_mode
     except OSError as error:
-        return "" if error.errno in _ABSENT else error.errno or 0
+        return ("" if error.errno in _ABSENT else error.errno,)
     except ValueError:  # no file system accepts such a path
-        return ""
-    return "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "other"
-
-
-def _listing(path: str) -> Listing | int:
+        return ("",)
+    kind = "folder" if stat.S_ISDIR(mode) else "file" if stat.S_ISREG(mode) else "other"
+    if not is_read or kind != "file":  # reading a pipe may block
+        return (kind,)
     try:
-        with os.scandir(path) as entries:
-            found = sorted((entry.name, entry.is_dir()) for entry in entries if not entry.name.startswith("."))
+        with open(path, "rb") as stream:
+            return kind, _digest(stream.read())
     except OSError as error:
-        return error.errno or 0
+        return kind, error.errno
+
+
+def _listing(path: str) -> Listing:
+    with os.scandir(path) as entries:
+        found = sorted((entry.name, entry.is_dir()) for entry in entries if not entry.name.startswith("."))
     folders, others = (tuple(name for name, is_folder in found if is_folder is wanted) for wanted in (True, False))
     return folders, others
+
+
+def _digest(content: bytes) -> int:
+    """Return size and CRC-32. They miss one in 2**32 edits that keep the size, and only where times do not tell."""
+    return len(content) << 32 | crc32(content)
+
+
+def _stamp(file: str | int) -> Stamp | None:
+    try:
+        status = os.stat(file)
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
+
+
+def _is_settled(stamp: Stamp, now: int) -> bool:
+    """Return whether every write after `now` (ns) changes the stamp.
+
+    Not if the file was just written, or later than `now` because the clock was set back. Nor if the file system has
+    whole seconds, such as squashfs and FAT: all files of its images may have the same time.
+    """
+    _, modified, changed, _ = stamp
+    return max(modified, changed) < now - _TICK and changed % _SECOND != 0
 
 
 @cache
@@ -256,20 +300,22 @@ def _process() -> Mapping[str, object]:
 
     Computed once, because the process imports each module only once.
     """
-    from router.declared import CHECKSUM
-
+    code = sorted(path for folder in (_PACKAGE, *_SCHEMAS) for path in _code_below(folder))
     packages = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
     return {
         "Python": (sys.version, sys.executable, sys.prefix, tuple(sys.path[_HAS_FOLDER_OF_COMMAND:])),
-        "the router's C library": CHECKSUM,
-        "the router's code": tuple(sorted(each for place in (_PACKAGE, *_SCHEMAS) for each in _stamps(place))),
-        "a variable of ROS": tuple(sorted(each for each in os.environ.items() if each[0].startswith(_OF_ROS))),
-        "an installed package": tuple((path, _stamp(os.stat(path))) for path in packages if os.path.isdir(path)),
+        "the router's code": _times(code),
+        "a variable of ROS": tuple(sorted(item for item in os.environ.items() if item[0].startswith(_OF_ROS))),
+        "an installed package": _times(packages),
     }
 
 
-def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield each code file below a folder with its times (ns) and size, which change when it is written."""
+def _times(paths: Sequence[str]) -> int:
+    """Return a digest of the sizes and times of files whose contents take too long to read."""
+    return _digest(ascii([(path, (_stamp(path) or ())[:3]) for path in paths]).encode())
+
+
+def _code_below(folder: str) -> Iterator[str]:
     try:
         entries = [*os.scandir(folder)]
     except OSError:
@@ -277,32 +323,6 @@ def _stamps(folder: str) -> Iterator[tuple[str, tuple[int, ...]]]:
     for entry in entries:
         if entry.is_dir(follow_symlinks=False):
             if entry.name not in ("__pycache__", _ASSETS):
-                yield from _stamps(entry.path)
+                yield from _code_below(entry.path)
         elif entry.name.endswith(_CODE):
-            with suppress(FileNotFoundError):  # it was just removed
-                yield entry.path, _stamp(entry.stat(follow_symlinks=False))
-
-
-def _stamp(status: os.stat_result) -> tuple[int, ...]:
-    return status.st_mtime_ns, status.st_ctime_ns, status.st_size
-
-
-_OF_FILES = frozenset({"file", "kind", "folder", "link"})
-_PROBES: Mapping[str, Callable[[str], object]] = {
-    "file": _content,
-    "kind": _kind,
-    "folder": _listing,
-    "link": os.path.realpath,
-    "variable": os.environ.get,
-    "names": lambda _: tuple(sorted(os.environ)),
-    "process": lambda name: _process().get(name),
-}
-_WORDS: Mapping[str, str] = {
-    "file": "the file {}",
-    "kind": "the file {}",
-    "folder": "the folder {}",
-    "link": "where the path {} leads",
-    "variable": "the variable {}",
-    "names": "the set of variables",
-    "process": "{}",
-}
+            yield entry.path

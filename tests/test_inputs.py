@@ -7,8 +7,10 @@ import ast
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -146,6 +148,119 @@ def test_each_edit_between_two_starts_is_found(edit: str) -> None:
     assert named in changed_in_new_process(plain)
 
 
+def rewrite(path: str, text: str) -> None:
+    """Replace a file by one of the same size, as editors do."""
+    assert len(text) == Path(path).stat().st_size
+    put(f"{path}.new", text)
+    Path(f"{path}.new").rename(path)
+
+
+def restore(path: str, text: str) -> None:
+    """Restore an earlier version with its time, like `cp -p` and rsync."""
+    written = Path(path).stat().st_mtime_ns
+    rewrite(path, text)
+    os.utime(path, ns=(written, written))
+
+
+def restore_in_place(path: str, text: str) -> None:
+    written = Path(path).stat().st_mtime_ns
+    Path(path).write_text(text, encoding="utf-8")
+    os.utime(path, ns=(written, written))
+
+
+def link_to(path: str, text: str) -> None:
+    """Retarget a link to a file of the same size and time."""
+    written = Path(path).stat().st_mtime_ns
+    put("elsewhere/file", text)
+    os.utime("elsewhere/file", ns=(written, written))
+    Path(path).unlink()
+    Path(path).symlink_to(Path("elsewhere/file").absolute())
+
+
+def link_to_folder(path: str, text: str) -> None:
+    """Retarget a link to a folder that has the same names."""
+    folder = Path(path).parent
+    shutil.copytree(folder, "elsewhere")
+    restore_in_place(f"elsewhere/{Path(path).name}", text)
+    folder.rename("before")
+    folder.symlink_to(Path("elsewhere").absolute())
+
+
+WAYS = [put, rewrite, restore, restore_in_place, link_to, link_to_folder]
+
+
+@pytest.fixture
+def settled(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, whose files count as written long ago."""
+    monkeypatch.setattr(inputs, "_TICK", 0)
+    time.sleep(0.02)  # more than a tick of the kernel
+    return place
+
+
+@pytest.mark.usefixtures("settled")
+def test_files_that_were_written_long_ago_are_not_read_before_the_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, plain = compiled()
+    monkeypatch.setattr(inputs, "open", None, raising=False)
+    assert changed_in_new_process(plain) == ""
+
+
+@pytest.mark.usefixtures("settled")
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("path", "before", "after"),
+    [
+        ("routes/base.yaml", BASE, BASE.replace("5000", "5001")),
+        ("protos/envelope.proto", PROTO, PROTO.replace("value = 2", "value = 3")),
+        ("under/share/our_msgs/msg/Reading.msg", MSG, MSG.replace("int32", "int64")),
+    ],
+)
+def test_a_change_that_keeps_the_size_is_found(
+    way: Callable[[str, str], None], path: str, before: str, after: str
+) -> None:
+    program, plain = compiled()
+    way(path, after)
+    assert changed_in_new_process(plain) != ""
+    assert (compiled(program)[0].protos is program.protos) is ("protos" not in path)
+    assert not inputs.are_same(compiled()[1], plain)
+    if way is not link_to_folder:
+        Path(path).unlink()
+        put(path, before)
+        assert changed_in_new_process(plain) == "", "the content is the same again"
+        assert inputs.are_same(compiled()[1], plain)
+
+
+HOUR = 3_600_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("age", "second", "is_found"),
+    [(HOUR, 1, False), (1, 1, True), (-HOUR, 1, True), (HOUR, 0, True)],
+    ids=["written long ago", "just written", "a clock that was set back", "whole seconds"],
+)
+def test_contents_are_compared_where_times_do_not_tell(
+    age: int, second: int, is_found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = (time.time_ns() - age) // 1_000_000_000 * 1_000_000_000 + second
+    monkeypatch.setattr(inputs, "_stamp", lambda _: (11, written, written, 1))
+    table = tmp_path / "table.yaml"
+    table.write_text("port: 5000\n")
+    with inputs.noted() as read:
+        inputs.read_text(table)
+    table.write_text("port: 5001\n")
+    assert (inputs.changed(read.plain()) != "") is is_found
+
+
+@pytest.mark.usefixtures("place")
+def test_a_package_that_is_installed_is_found(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packages = place / "lib/site-packages"
+    packages.mkdir(parents=True)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(packages)])
+    _, plain = compiled()
+    assert changed_in_new_process(plain) == ""
+    (packages / "our_msgs").mkdir()
+    assert changed_in_new_process(plain) == "an installed package"
+
+
 @pytest.mark.usefixtures("place")
 def test_what_is_not_read_may_change() -> None:
     _, plain = compiled()
@@ -171,7 +286,7 @@ def test_a_reload_that_takes_over_the_protos_notes_the_same_inputs_as_a_start() 
     program, plain = compiled()
     again, after = compiled(program)
     assert again.protos is program.protos
-    assert after == plain
+    assert inputs.are_same(after, plain)
 
 
 @pytest.mark.usefixtures("place")
@@ -180,7 +295,7 @@ def test_a_reload_compiles_the_protos_again_once_their_lock_has_changed() -> Non
     assert main(["schema", "lock", "-t", "routes/rover.yaml"]) == 0
     again, after = compiled(program)
     assert again.protos is not program.protos
-    assert after == compiled()[1]
+    assert inputs.are_same(after, compiled()[1])
 
 
 @pytest.mark.usefixtures("place", "variables")
@@ -190,7 +305,7 @@ def test_the_table_of_the_command_line_and_the_ros_parameters_are_inputs(place: 
         variables = Variables(table_variables(ros_parameters(["--params-file", "params.yaml"])), inputs.ENVIRONMENT)
         assert table_path(NO_TABLE) == Path("routes/rover.yaml")
     assert [variables.get(name) for name in ("PORT", "NOWHERE")] == ["5005", None]
-    names = {name for _, name, _ in asked.plain()}
+    names = {name for _, name, *_ in asked.plain()}
     assert {f"{place}/params.yaml", f"{place}/routes/rover.yaml", "ROUTER_TABLE"} <= names
     assert "PORT" not in names, "a ROS parameter has set it"
     put("params.yaml", "/**: {ros__parameters: {port: 5006}}")
@@ -210,9 +325,9 @@ def test_a_recording_goes_on_from_an_earlier_one_and_has_what_is_noted_within() 
             inputs.is_file("routes/rover.yaml")
         inputs.ENVIRONMENT.get("PORT")
     inputs.is_file("protos")
-    ours = [(kind, Path(name).name) for kind, name, _ in read.plain() if kind in {"file", "kind", "variable"}]
-    assert ours == [("file", "base.yaml"), ("kind", "rover.yaml"), ("variable", "PORT")]
-    assert [kind for kind, _, _ in inner.plain()] == ["kind"]
+    ours = [(kind, Path(name).name) for kind, name, *_ in read.plain() if kind in {"file", "variable"}]
+    assert ours == [("file", "base.yaml"), ("file", "rover.yaml"), ("variable", "PORT")]
+    assert [Path(name).name for _, name, *_ in inner.plain()] == ["rover.yaml"]
 
 
 @pytest.mark.usefixtures("place")
@@ -232,14 +347,14 @@ def test_a_pipe_is_neither_waited_for_nor_read_before_the_compile() -> None:
         inputs.read_text("routes/base.yaml")
     reading, writing = os.pipe()
     os.write(writing, BASE.encode())
-    plain = tuple((kind, f"/dev/fd/{reading}" if kind == "file" else name, value) for kind, name, value in read.plain())
-    assert f"/dev/fd/{reading}" in inputs.changed(plain)
+    [value] = [value for kind, _, value, _ in read.plain() if kind == "file"]
+    assert inputs.changed((("file", f"/dev/fd/{reading}", value, None),)) == f"the file /dev/fd/{reading}"
     assert os.read(reading, 1000) == BASE.encode()
     os.close(reading)
     os.close(writing)
 
 
-@pytest.mark.parametrize("edit", ["written", "new", "gone"])
+@pytest.mark.parametrize("edit", ["written", "restored", "new", "gone"])
 def test_code_of_the_router_that_changed_is_found_by_the_next_process(
     edit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,6 +369,8 @@ def test_code_of_the_router_that_changed_is_found_by_the_next_process(
     assert changed_in_new_process(read.plain()) == ""
     if edit == "gone":
         (package / "cli/run.py").unlink()
+    elif edit == "restored":
+        restore(f"{package}/cli/run.py", "fail")
     else:
         put(f"{package}/cli/{'run' if edit == 'written' else 'new'}.py", "pass")
     assert inputs.changed(read.plain()) == "", "this process runs the code that it has imported"
@@ -276,7 +393,7 @@ with inputs.recording() as read:
     checked = check_table(Path("routes/rover.yaml"))
     checked.program
 found = list(opened)
-print(json.dumps([found, [name for _, name, _ in read.plain()], list(map(str, checked.diagnostics))]))
+print(json.dumps([found, [name for _, name, *_ in read.plain()], list(map(str, checked.diagnostics))]))
 """
 
 

@@ -16,7 +16,7 @@ IMPORTS = {
     "declared": "",
     "errors": "",
     "shortage": "",
-    "inputs": "declared errors shortage",
+    "inputs": "errors shortage",
     "assets": "",
     "clock": "",
     "lean": "",

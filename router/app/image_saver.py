@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from router.inputs import are_same
 from router.log import fault, logger
 from router.startup_image import store
 from router.threads import DaemonThread
@@ -35,7 +36,7 @@ class ImageSaver:
             self._failed(error)
 
     def _save(self, image: Image, read: Plain) -> None:
-        if read == self._stored:
+        if self._stored is not None and are_same(read, self._stored):
             store.clear_tries()
             return
         try:

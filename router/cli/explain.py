@@ -124,7 +124,7 @@ def _kept(table: Path) -> Iterator[str]:
     for path, kept, why in files:
         if kept is None:
             yield f"{path} cannot be used as a kept program: {why}"
-        elif any(kind == "file" and os.path.realpath(name) == real for kind, name, _ in kept.inputs):
+        elif any(kind == "file" and os.path.realpath(name) == real for kind, name, *_ in kept.inputs):
             is_any = True
             command, where, python = kept.identity
             since = time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(kept.written))

@@ -19,7 +19,8 @@ from router.startup_image import store
 
 IMAGE = bytes(range(256)) * 3
 PARTS = {"listeners": [("wifi", 5000)], "deadmen": b"\0brake", "ratio": 0.5, "none": None}
-UNCHANGED = (("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),)
+VARIABLE = "A_VARIABLE_THAT_NOBODY_SETS"
+UNCHANGED = (("variable", VARIABLE, (None,), None),)
 
 
 @pytest.fixture(autouse=True)
@@ -84,8 +85,8 @@ def test_each_command_line_and_folder_has_its_own(tmp_path: Path, monkeypatch: p
 
 def test_one_whose_inputs_changed_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     keep()
-    monkeypatch.setenv(UNCHANGED[0][1], "5000")
-    assert refused() == f"the variable {UNCHANGED[0][1]} has changed"
+    monkeypatch.setenv(VARIABLE, "5000")
+    assert refused() == f"the variable {VARIABLE} has changed"
 
 
 def test_no_flipped_bit_is_overlooked(cache: Path) -> None:
@@ -199,7 +200,7 @@ def test_one_of_another_python_or_format_is_not_used(monkeypatch: pytest.MonkeyP
     assert refused() == "it has another format"
 
 
-@pytest.mark.parametrize("strange", [1, None, (("no such kind", "name", None),), (("file", 5, None),)])
+@pytest.mark.parametrize("strange", [1, None, (("no such kind", "name", None),), (("file", 5, None, None),)])
 def test_a_whole_file_with_other_content_is_refused_with_a_reason(
     strange: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,7 +216,7 @@ def test_a_program_whose_inputs_changed_since_they_were_read_is_not_kept(
 ) -> None:
     keep("before")
     with monkeypatch.context() as changed:
-        changed.setenv(UNCHANGED[0][1], "5000")
+        changed.setenv(VARIABLE, "5000")
         with pytest.raises(OSError, match="has changed meanwhile"):
             keep("after")
     kept, _ = store.find()
@@ -287,7 +288,7 @@ from router.image.image import Image
 from router.startup_image import store
 for number in range(200):
     image = Image(names=number, memory=bytes([number]) * 50_000)
-    store.write((("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),), image)
+    store.write((("variable", "A_VARIABLE_THAT_NOBODY_SETS", (None,), None),), image)
 """
 
 
@@ -331,7 +332,7 @@ import os, sys
 sys.argv = ["router", "run"]
 from router.image.image import Image
 from router.startup_image import store
-unchanged = (("variable", "A_VARIABLE_THAT_NOBODY_SETS", None),)
+unchanged = (("variable", "A_VARIABLE_THAT_NOBODY_SETS", (None,), None),)
 store.write(unchanged, Image(names="before"))
 REMOUNT
 try:
