@@ -15,7 +15,7 @@ from router.compiler.cdr import HEADER, put_length, put_text
 from router.compiler.program import GatewayPlan
 from router.log import logger
 from router.observe import problems
-from router.observe.health import PERIOD, Look
+from router.observe.health import PERIOD, HealthSnapshot
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
 from router.observe.watch import Health
@@ -86,9 +86,9 @@ class Diagnostics:
 class Report:
     """The statuses of a router at one time."""
 
-    def __init__(self, look: Look) -> None:
-        self._look = look
-        self._program = look.program
+    def __init__(self, health: HealthSnapshot) -> None:
+        self._health = health
+        self._program = health.program
         self._host = platform.node()
 
     def statuses(self) -> Iterator[Status]:
@@ -109,7 +109,7 @@ class Report:
         """Return the router's status, with the problems that belong to no listener, endpoint or route."""
         table = self._program.table
         places = {"listener", *_TO_ENDPOINTS}
-        problems = (each for each in self._look.problems if not each.routes and not places & each.labels.keys())
+        problems = (each for each in self._health.problems if not each.routes and not places & each.labels.keys())
         values = [
             ("table", table.path.name),
             ("table sha256", table.sha256),
@@ -118,7 +118,7 @@ class Report:
         return _status("router", self._host, problems, "routing", values)
 
     def _listener(self, name: str) -> Status:
-        total = self._look.now.total
+        total = self._health.now.total
         values = [
             ("address", self._program.table.listeners[name].bound_to),
             ("received", total("datagrams_received", name)),
@@ -134,25 +134,27 @@ class Report:
         values = [
             ("address", endpoint.address.value),
             ("kind", endpoint.kind.value),
-            ("silent for", age_text(self._look.silence.get(name))),
+            ("silent for", age_text(self._health.silence.get(name))),
             ("received", self._of_endpoint("messages_received", name)),
             ("sent", self._of_endpoint("datagrams_sent", name)),
             *((f"dropped: {reason}", n) for reason, n in self._dropped_for(name)),
         ]
         sends = any(source.value == name for route in routes for source in route.sources)
-        well = "sends" if self._look.was_heard(name) else "nothing received yet" if sends else "is not expected to send"
-        if any(name in away for away in self._look.away.values()):
+        well = (
+            "sends" if self._health.was_heard(name) else "nothing received yet" if sends else "is not expected to send"
+        )
+        if any(name in away for away in self._health.away.values()):
             well = "is silent: nobody drives"
         problems = self._labelled(name, *_TO_ENDPOINTS)
         return _status(f"endpoint/{name}", str(endpoint.address.value), problems, well, values)
 
     def _route(self, route: Route) -> Status:
-        name, look = route.name, self._look
-        received = look.now.total("messages_received", name)
-        fresh = sum(n for labels, n in look.grown("messages_received") if labels[0] == name)
+        name, health = route.name, self._health
+        received = health.now.total("messages_received", name)
+        fresh = sum(n for labels, n in health.grown("messages_received") if labels[0] == name)
         values = [
             ("received", received),
-            ("received per second", f"{fresh / look.seconds:.1f}"),
+            ("received per second", f"{fresh / health.seconds:.1f}"),
             *((f"sent to {target}", n) for (target,), n in self._counted("datagrams_sent", name)),
             *((f"published on {topic}", n) for (topic,), n in self._counted("messages_published", name)),
             *((f"waiting for {target}", n) for (target,), n in self._counted("messages_waiting", name)),
@@ -165,9 +167,9 @@ class Report:
     def _gateway(self, gateway: GatewayPlan) -> Status:
         name = gateway.settings.name
         values = [
-            ("clients", self._look.now.total("gateway_clients", name)),
+            ("clients", self._health.now.total("gateway_clients", name)),
             *((f"topics {state}", n) for (state,), n in self._counted("gateway_topics", name)),
-            ("sent", self._look.now.total("messages_sent", name)),
+            ("sent", self._health.now.total("messages_sent", name)),
             *((f"received from {source}", n) for (source,), n in self._counted("messages_received", name)),
             *((f"rejected: {reason}", n) for (reason,), n in self._counted("datagrams_rejected", name)),
             *self._dropped(name),
@@ -176,10 +178,10 @@ class Report:
         return _status(f"gateway/{name}", self._host, problems, "serves its clients", values)
 
     def _labelled(self, name: str, *labels: str) -> list[Problem]:
-        return [each for each in self._look.problems if any(each.labels.get(label) == name for label in labels)]
+        return [each for each in self._health.problems if any(each.labels.get(label) == name for label in labels)]
 
     def _concerning(self, route: str) -> list[Problem]:
-        return [each for each in self._look.problems if route in each.routes]
+        return [each for each in self._health.problems if route in each.routes]
 
     def _dropped(self, route: str) -> Iterator[tuple[str, int]]:
         for (target, reason), n in self._counted("messages_dropped", route):
@@ -188,18 +190,18 @@ class Report:
     def _dropped_for(self, endpoint: str) -> Iterator[tuple[str, int]]:
         """Yield reasons and numbers of drops, summed over all routes."""
         sums: Counter[str] = Counter()
-        for (_, target, reason), n in self._look.now.counts("messages_dropped").items():
+        for (_, target, reason), n in self._health.now.counts("messages_dropped").items():
             if target == endpoint and n:
                 sums[reason] += int(n)
         yield from sums.items()
 
     def _of_endpoint(self, metric: str, endpoint: str) -> int:
         """Return the sum over all routes of a metric whose second label is the endpoint."""
-        return int(sum(value for labels, value in self._look.now.counts(metric).items() if labels[1] == endpoint))
+        return int(sum(value for labels, value in self._health.now.counts(metric).items() if labels[1] == endpoint))
 
     def _counted(self, metric: str, first: str) -> Iterator[tuple[Labels, int]]:
         """Yield the series that are not 0, by their labels after the first."""
-        return ((rest, int(value)) for rest, value in self._look.now.of(metric, first).items() if value)
+        return ((rest, int(value)) for rest, value in self._health.now.of(metric, first).items() if value)
 
 
 _TO_ENDPOINTS = ("endpoint", "target", "destination")

@@ -1,7 +1,7 @@
 """Decides what is wrong with a running router.
 
-The status page, `/diagnostics`, `router status`, `router top` and doctor all show `Look.problems`. The Prometheus
-alerts are named after the kinds; tests compare words, levels and thresholds.
+The status page, `/diagnostics`, `router status`, `router top` and doctor all show `HealthSnapshot.problems`. The
+Prometheus alerts are named after the kinds; tests compare words, levels and thresholds.
 """
 
 from __future__ import annotations
@@ -128,10 +128,10 @@ _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, s
 
 
 @dataclass(frozen=True)
-class Look:
+class HealthSnapshot:
     """The state of a router. `snapshots` are those of the last WINDOW seconds, oldest first.
 
-    Times in seconds. `standing`: how long the receive thread has made no progress. `tripped`: how long each active
+    Times in seconds. `stalled_for`: how long the receive thread has made no progress. `tripped`: how long each active
     deadman has been sending, by route. `mismatches`: recent senders of messages that no route accepts from them, judged
     by this program. `replies`: what boards have shown about the brakes of active deadmen. `bursts`: recent bursts of
     commands, by route. `returned`: how long ago each endpoint was heard again after its last silence.
@@ -139,7 +139,7 @@ class Look:
 
     program: Program
     snapshots: Sequence[Snapshot]
-    standing: float
+    stalled_for: float
     tripped: Mapping[str, float]
     mismatches: frozenset[Mismatch] = frozenset()
     replies: Replies = field(default_factory=dict)
@@ -256,8 +256,8 @@ class Look:
         return unsent
 
     def _states(self) -> Iterator[Problem]:
-        if self.standing > Kind.RECEIVE_STUCK.threshold:
-            yield self._problem(Kind.RECEIVE_STUCK, {}, f": no progress for {age_text(self.standing)}")
+        if self.stalled_for > Kind.RECEIVE_STUCK.threshold:
+            yield self._problem(Kind.RECEIVE_STUCK, {}, f": no progress for {age_text(self.stalled_for)}")
         if not self.now.total(Kind.RELOAD_FAILED.metric):
             yield self._problem(Kind.RELOAD_FAILED, {})
         for (name, mode), connections in self.now.counts(Kind.GATEWAY_DISCONNECTED.metric).items():

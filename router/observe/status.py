@@ -91,12 +91,12 @@ class Status:
 
     def health(self) -> Json:
         """Return all problems. `name`, `table`: file name and SHA-256 of the table. `received`: since the start."""
-        look = self._health.look()
+        health = self._health.look()
         return {
-            "name": look.program.table.path.name,
-            "table": look.program.table.sha256,
-            "received": look.now.total("datagrams_received"),
-            "problems": [problem.json() for problem in look.problems],
+            "name": health.program.table.path.name,
+            "table": health.program.table.sha256,
+            "received": health.now.total("datagrams_received"),
+            "problems": [problem.json() for problem in health.problems],
         }
 
     def map(self) -> Json:

@@ -8,7 +8,7 @@ from collections import deque
 from router.clock import boottime_ns
 from router.log import logger
 from router.observe.bursts import Bursts
-from router.observe.health import PERIOD, WINDOW, Look
+from router.observe.health import PERIOD, WINDOW, HealthSnapshot
 from router.observe.problems import Kind
 from router.observe.running import Running
 from router.observe.snapshot import DELIVERED, Snapshot, snapshot
@@ -46,7 +46,7 @@ class Watch:
         self._progress, self._progressed = -1, 0
         self._lock = threading.Lock()
 
-    def look(self, now: int) -> Look:
+    def look(self, now: int) -> HealthSnapshot:
         """Return the state at `now` (boot clock, ns). One snapshot per PERIOD is kept for later calls."""
         with self._lock:
             program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
@@ -74,9 +74,9 @@ class Watch:
             bursts = self._bursts.recent(latest.at, WINDOW)
         recent = frozenset(each for each, at in self._running.mismatches().items() if now - at < WINDOW * 1e9)
         replies = self._running.replies()
-        return Look(program, snapshots, self.standing(now), tripped, recent, replies, bursts, returned)
+        return HealthSnapshot(program, snapshots, self.stalled_for(now), tripped, recent, replies, bursts, returned)
 
-    def standing(self, now: int) -> float:
+    def stalled_for(self, now: int) -> float:
         """Return how long (s) the receive thread has made no progress, as seen by calls of this method."""
         progress = self._running.progress()
         with self._lock:
@@ -98,13 +98,13 @@ class Health:
     @property
     def is_stuck(self) -> bool:
         """Whether the receive thread is stuck now."""
-        return self._watch.standing(boottime_ns()) > Kind.RECEIVE_STUCK.threshold
+        return self._watch.stalled_for(boottime_ns()) > Kind.RECEIVE_STUCK.threshold
 
     def close(self) -> None:
         self._stopping.set()
         join_or_abandon(self._thread)
 
-    def look(self) -> Look:
+    def look(self) -> HealthSnapshot:
         return self._watch.look(boottime_ns())
 
     def _run(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from router.compiler.program import Program
-from router.observe.health import Look
+from router.observe.health import HealthSnapshot
 from router.observe.watch import Watch
 from tests.observe.fake_running import FakeRunning
 
@@ -44,7 +44,7 @@ class Counting(FakeRunning):
     def hear(self, endpoint: str) -> None:
         self.count("endpoint_silence_seconds", endpoint, to=self.now)
 
-    def look(self, after: float) -> Look:
+    def look(self, after: float) -> HealthSnapshot:
         """Evaluate health this many seconds later."""
         self.now += int(after * SECOND)
         return self.watch.look(self.now)

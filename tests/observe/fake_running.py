@@ -19,7 +19,7 @@ from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import SourceSpan
 from router.net.doors import Door
-from router.observe.health import Look
+from router.observe.health import HealthSnapshot
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.obedience import Reply
@@ -137,18 +137,18 @@ class FakeHealth:
     def is_stuck(self) -> bool:
         return self._running.is_stuck
 
-    def look(self) -> Look:
-        look = self._look()
-        snapshots = (self._first.now, look.now)
-        tripped = dict.fromkeys(look.tripped, self.parked)
-        standing = 3.0 if self.is_stuck else 0.0
-        return replace(look, snapshots=snapshots, standing=standing, tripped=tripped)
+    def look(self) -> HealthSnapshot:
+        health = self._look()
+        snapshots = (self._first.now, health.now)
+        tripped = dict.fromkeys(health.tripped, self.parked)
+        stalled_for = 3.0 if self.is_stuck else 0.0
+        return replace(health, snapshots=snapshots, stalled_for=stalled_for, tripped=tripped)
 
-    def _look(self) -> Look:
+    def _look(self) -> HealthSnapshot:
         collected = self._running.collected
-        look = self._watch.look(boottime_ns())
+        health = self._watch.look(boottime_ns())
         self._running.collected = collected
-        return look
+        return health
 
 
 def served(

@@ -137,10 +137,10 @@ def test_every_problem_is_told_somewhere(router: Counting) -> None:
     router.count("unhandled", "arm_diag", to=9)
     router.count("messages_waiting", "imu_info", "imu_data", to=30)
     router.count("qos_incompatible", "imu_info", "imu_data", "reliability", to=1)
-    look = router.look(6)
-    messages = " ".join(status.message for status in Report(look).statuses())
-    assert len(look.problems) > 8
-    assert [problem.text for problem in look.problems if problem.text not in messages] == []
+    health = router.look(6)
+    messages = " ".join(status.message for status in Report(health).statuses())
+    assert len(health.problems) > 8
+    assert [problem.text for problem in health.problems if problem.text not in messages] == []
 
 
 def test_numbers_are_told_with_their_reasons(router: Counting) -> None:
