@@ -277,8 +277,8 @@ _RELATIONS: dict[str, Callable[[object, object], bool]] = {
     "UNEQUAL": lambda a, b: a != b,
     "LESS": lambda a, b: a < b,  # type: ignore[operator]
     "LESS_OR_EQUAL": lambda a, b: a <= b,  # type: ignore[operator]
-    "MORE": lambda a, b: a > b,  # type: ignore[operator]
-    "MORE_OR_EQUAL": lambda a, b: a >= b,  # type: ignore[operator]
+    "GREATER": lambda a, b: a > b,  # type: ignore[operator]
+    "GREATER_OR_EQUAL": lambda a, b: a >= b,  # type: ignore[operator]
 }
 
 

@@ -187,7 +187,7 @@ static inline enum order order_of_texts(const struct value *a, const struct valu
     case UNEQUAL: return (a) != (b);       \
     case LESS: return (a) < (b);           \
     case LESS_OR_EQUAL: return (a) <= (b); \
-    case MORE: return (a) > (b);           \
+    case GREATER: return (a) > (b);        \
     default: return (a) >= (b);            \
     }
 

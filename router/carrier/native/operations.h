@@ -111,7 +111,7 @@ enum op {
     /* Conversions: */
     OP_INTEGER_TO_REAL, /* `flag` 1: the integer is unsigned */
     OP_ROUND,           /* ties go to the even integer. These four give a signed integer. They refuse NaN and infinity as
-                           LOSS_NON_FINITE, and numbers beyond 64 bits as LOSS_MAPPING_ERROR */
+                           DROP_NON_FINITE, and numbers beyond 64 bits as DROP_MAPPING_ERROR */
     OP_TRUNCATE,
     OP_FLOOR,
     OP_CEIL,
@@ -172,7 +172,7 @@ enum op {
 /* Which operands of an operation with integers are unsigned, and whether its result is. */
 enum sign { FIRST_UNSIGNED = 1, SECOND_UNSIGNED = 2, THIRD_UNSIGNED = 4, RESULT_UNSIGNED = 8 };
 
-enum relation { EQUAL, UNEQUAL, LESS, LESS_OR_EQUAL, MORE, MORE_OR_EQUAL };
+enum relation { EQUAL, UNEQUAL, LESS, LESS_OR_EQUAL, GREATER, GREATER_OR_EQUAL };
 
 /* The types of an exact comparison, the left operand first. */
 enum compared {

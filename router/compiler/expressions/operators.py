@@ -99,8 +99,8 @@ _RELATIONS: Mapping[type[ast.cmpop], Relation] = {
     ast.NotEq: Relation.UNEQUAL,
     ast.Lt: Relation.LESS,
     ast.LtE: Relation.LESS_OR_EQUAL,
-    ast.Gt: Relation.MORE,
-    ast.GtE: Relation.MORE_OR_EQUAL,
+    ast.Gt: Relation.GREATER,
+    ast.GtE: Relation.GREATER_OR_EQUAL,
 }
 _COMPUTED: Mapping[Operator, Callable[[Any, Any], Any]] = {
     Operator.ADD: operator.add,

@@ -41,8 +41,8 @@ class Relation(Enumeration):
     UNEQUAL = "!="
     LESS = "<"
     LESS_OR_EQUAL = "<="
-    MORE = ">"
-    MORE_OR_EQUAL = ">="
+    GREATER = ">"
+    GREATER_OR_EQUAL = ">="
 
 
 @dataclass(frozen=True, slots=True)

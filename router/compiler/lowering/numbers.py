@@ -65,10 +65,10 @@ def fitted(made: Routine, kind: Kind, to: Kind) -> Routine:
 
 
 _SWAPPED: Mapping[Relation, Relation] = {
-    Relation.LESS: Relation.MORE,
-    Relation.LESS_OR_EQUAL: Relation.MORE_OR_EQUAL,
-    Relation.MORE: Relation.LESS,
-    Relation.MORE_OR_EQUAL: Relation.LESS_OR_EQUAL,
+    Relation.LESS: Relation.GREATER,
+    Relation.LESS_OR_EQUAL: Relation.GREATER_OR_EQUAL,
+    Relation.GREATER: Relation.LESS,
+    Relation.GREATER_OR_EQUAL: Relation.LESS_OR_EQUAL,
 }
 """Relations that change if the two values are swapped, with the swapped relation."""
 
