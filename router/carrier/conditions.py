@@ -7,7 +7,7 @@ import ctypes
 from router.compiler.lowering import LoweredCondition
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
-from router.declared import EVALUATED, LOSSES
+from router.declared import DROP_REASONS, EVALUATED
 
 
 class NativeCondition:
@@ -29,6 +29,6 @@ class NativeCondition:
         sender, holds = native_values([source.encode()], named), ctypes.c_bool()
         routine, size = ctypes.byref(self._routine), len(payload)
         outcome = self._holds(self._layout, routine, sender, received_at, payload, size, ctypes.byref(holds))
-        if outcome == LOSSES:
+        if outcome == DROP_REASONS:
             raise MemoryError("a condition cannot be evaluated")
         return holds.value if outcome == EVALUATED else None

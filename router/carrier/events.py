@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from socket import inet_ntoa
 from typing import Union, cast
 
-from router.carrier.reasons import LOSSES, REJECTIONS
+from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
 from router.compiler.refusals import why_refused
@@ -130,7 +130,7 @@ class EventReader:
             place = self._place(route, topic, target, event.generation, event.place)
             detail = ": ".join(filter(None, (place, detail)))
         return CountedReport(
-            event.counter, Report("drop", route, target, LOSSES[event.reason], _error(event.error), detail)
+            event.counter, Report("drop", route, target, DROP_REASON_NAMES[event.reason], _error(event.error), detail)
         )
 
 

@@ -8,7 +8,7 @@ import sys
 from functools import cache
 from socket import inet_ntoa
 
-from router.carrier.reasons import LOSSES, REJECTIONS
+from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.ring import Ring
 from router.compiler.refusals import why_refused
 from router.datagrams import Peer
@@ -73,7 +73,7 @@ class ActionRing:
         if it.action != Action.LOST:
             return "send_error" if error else "", error, rest
         detail = why_refused(it.refusal, rest) if it.refusal.kind else rest.decode(errors="replace")
-        return LOSSES[it.reason], detail or error, b""
+        return DROP_REASON_NAMES[it.reason], detail or error, b""
 
 
 @cache

@@ -8,14 +8,14 @@ from __future__ import annotations
 from router import datagrams
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute
 from router.compiler.program import Program
-from router.declared import Loss, Reason
+from router.declared import DropReason, Reason
 from router.table.model import Framing
 
 REJECTIONS = tuple(reason.name.lower() for reason in Reason)
-"""The names of REJECT_REASONS, by `enum reason`."""
+"""The names of `metrics.REJECT_REASONS`, by `enum reason`."""
 
-LOSSES = tuple(loss.name.lower() for loss in Loss)
-"""The names of DROP_REASONS, by `enum loss`."""
+DROP_REASON_NAMES = tuple(reason.name.lower() for reason in DropReason)
+"""The names of `metrics.DROP_REASONS`, by `enum drop_reason`."""
 
 
 def why_rejected(program: Program, listener: str, data: bytes, length: int) -> str:

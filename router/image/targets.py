@@ -18,7 +18,7 @@ from router.table.model import OnLimit
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
 
-_DROP_REASONS = [loss.name.lower() for loss in c.Loss]
+_DROP_REASONS = [reason.name.lower() for reason in c.DropReason]
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,7 +137,7 @@ uint32_t seam_target(struct deferring *of, struct deferral *deferral, int64_t pe
     of->deferrals[number] = deferral;
     *made = (struct target){.period = period, .priority = priority, .delivered = first,
                             .delivered_bytes = first + 1, .topic = is_topic ? &of->topic : NULL};
-    for (uint32_t reason = 0; reason < LOSSES; reason++) made->dropped[reason] = first + 2 + reason;
+    for (uint32_t reason = 0; reason < DROP_REASONS; reason++) made->dropped[reason] = first + 2 + reason;
     if (deferral) seam_adopt(of, (struct timer *)deferral, number);
     return number;
 }

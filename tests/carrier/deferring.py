@@ -12,14 +12,14 @@ from typing import NamedTuple
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.owned import OwnedPointer, open_native
-from router.carrier.reasons import LOSSES
+from router.carrier.reasons import DROP_REASON_NAMES
 from router.image.openings import period
 from router.table.model import Priority
 from tests.carrier.building import MEMORY, sanitizing
 
 NEVER = (1 << 63) - 1
 _NOTED = Struct("@IIqII")
-_FATES = ("sent", "bytes", *LOSSES)
+_FATES = ("sent", "bytes", *DROP_REASON_NAMES)
 
 _FUNCTIONS: dict[str, tuple[type | None, tuple[type, ...]]] = {
     "seam_open": (c_void_p, ()),

@@ -11,7 +11,7 @@ enum { DELIVERED = -1, FILTERED_OUT = -2 };
 /* What became of a message at a target, in the order in which it did. The bytes that would leave follow. */
 struct noted {
     uint32_t size, target;
-    int32_t outcome; /* DELIVERED, FILTERED_OUT, or an enum loss */
+    int32_t outcome; /* DELIVERED, FILTERED_OUT, or an enum drop_reason */
     uint32_t place, length, reserved;
 };
 
@@ -54,7 +54,7 @@ static int32_t outcome_of(const struct delivering *of, const struct target *targ
     const counter *counters = of->routing.stage.counters;
     if (counters[target->delivered] != before[0]) return DELIVERED;
     if (counters[target->filtered] != before[1]) return FILTERED_OUT;
-    for (int32_t reason = 0; reason < LOSSES; reason++)
+    for (int32_t reason = 0; reason < DROP_REASONS; reason++)
         if (counters[target->dropped[reason]] != before[2 + reason]) return reason;
     abort();
 }
@@ -62,8 +62,8 @@ static int32_t outcome_of(const struct delivering *of, const struct target *targ
 static bool note(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
     struct delivering *of = (struct delivering *)stage;
     counter *counters = stage->counters;
-    int64_t before[2 + LOSSES] = {counters[target->delivered], counters[target->filtered]};
-    for (int reason = 0; reason < LOSSES; reason++) before[2 + reason] = counters[target->dropped[reason]];
+    int64_t before[2 + DROP_REASONS] = {counters[target->delivered], counters[target->filtered]};
+    for (int reason = 0; reason < DROP_REASONS; reason++) before[2 + reason] = counters[target->dropped[reason]];
     struct { struct lost_event event; char text[256]; } lost = {0};
     stage->reporter.left = 1;
     of->bytes.size = 0;

@@ -12,7 +12,7 @@ from typing import NamedTuple, Union
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.owned import OwnedPointer, open_native
-from router.carrier.reasons import LOSSES
+from router.carrier.reasons import DROP_REASON_NAMES
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
@@ -23,8 +23,8 @@ from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"
 _NOTED = Struct("@IIiIII")
-_OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_LOSS = range(6)
-_OF_TARGET = _FIRST_LOSS + c.LOSSES
+_OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_DROP = range(6)
+_OF_TARGET = _FIRST_DROP + c.DROP_REASONS
 _LOSS = Struct("@6Ii3I2I3q")
 """`struct lost_event`."""
 
@@ -107,7 +107,7 @@ class Delivering:
             made = c.Target(condition=routines.routine(target.condition), message=routines.routine(target.message))
             made.id, made.delivered, made.filtered = number, first + _DELIVERED, first + _FILTERED
             made.collected, made.delivered_bytes = first + _COLLECTED, first + _BYTES
-            made.dropped[:] = [first + _FIRST_LOSS + reason for reason in range(c.LOSSES)]
+            made.dropped[:] = [first + _FIRST_DROP + reason for reason in range(c.DROP_REASONS)]
             if target.message and not is_from_ros:
                 made.topic = ctypes.pointer(topic)
             targets.append(made)
@@ -189,7 +189,7 @@ class Delivering:
         """The nonzero counts of a target."""
         number = [each.label for each in self._lowered].index(label)
         of_target = self._counters[1 + number * _OF_TARGET :][:_OF_TARGET]
-        names = (None, "delivered", "filtered", "collected", None, *LOSSES)
+        names = (None, "delivered", "filtered", "collected", None, *DROP_REASON_NAMES)
         return {name: count for name, count in zip(names, of_target, strict=True) if name and count}
 
     def from_ros(self, data: bytes) -> list[Outcome]:
@@ -210,5 +210,7 @@ class Delivering:
                 start = at + _NOTED.size
                 yield Outcome(lowered.label, notes[start : start + length])
             else:
-                yield Outcome(lowered.label, FILTERED if outcome == -2 else LOSSES[outcome], lowered.places[place])
+                yield Outcome(
+                    lowered.label, FILTERED if outcome == -2 else DROP_REASON_NAMES[outcome], lowered.places[place]
+                )
             at += size

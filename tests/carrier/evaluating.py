@@ -19,7 +19,7 @@ CDR_HEADER = b"\0\1\0\0"
 C = c.ENUMERATORS
 """Constants of the headers, by name."""
 
-_LOSSES = {C["LOSS_MAPPING_ERROR"]: "mapping_error", C["LOSS_NON_FINITE"]: "non_finite"}
+_DROP_REASONS = {C["DROP_MAPPING_ERROR"]: "mapping_error", C["DROP_NON_FINITE"]: "non_finite"}
 INTEGER, REAL, TEXT, LIST = "integer", "real", "text", "list"
 
 
@@ -158,20 +158,20 @@ class Machine:
         value, at = c.Value(), c_uint32()
         made = self._routine(routine)
         outcome = self._library.seam_machine_value(self._address, byref(made), byref(value), byref(at))
-        return self._made(value, of) if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
+        return self._made(value, of) if outcome == c.EVALUATED else Refusal(_DROP_REASONS[outcome], at.value)
 
     def condition(self, *routine: Operation) -> bool | Refusal:
         is_true, at = c_bool(), c_uint32()
         made = self._routine(routine)
         outcome = self._library.evaluate_condition(self._address, byref(made), byref(is_true), byref(at))
-        return is_true.value if outcome == c.EVALUATED else Refusal(_LOSSES[outcome], at.value)
+        return is_true.value if outcome == c.EVALUATED else Refusal(_DROP_REASONS[outcome], at.value)
 
     def message(self, *routine: Operation) -> bytes | Refusal:
         at, size = c_uint32(), c_size_t()
         made = self._routine(routine)
         outcome = self._library.evaluate_message(self._address, byref(made), byref(at))
         if outcome != c.EVALUATED:
-            return Refusal(_LOSSES[outcome], at.value)
+            return Refusal(_DROP_REASONS[outcome], at.value)
         return ctypes.string_at(self._library.seam_machine_output(self._address, byref(size)), size.value)
 
     def _made(self, value: c.Value, of: str) -> object:

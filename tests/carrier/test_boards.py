@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from router.compiler.constants import envelope_of
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.mapping import build
-from router.declared import BoardRefusal, Loss
+from router.declared import BoardRefusal, DropReason
 from router.errors import Located, SourceSpan
 from router.image.boards import write_boards
 from router.table.model import FieldMap
@@ -29,8 +29,8 @@ from tests.oracles.boards import MISSING_FIELD, NON_FINITE, TOO_LARGE, Refusal, 
 PROTOS = Path(__file__).parent / "protos_of_boards"
 TEXTS, NUMBERS, TREE = 1, 2, 3
 LONGEST = 120
-REASONS = {Loss.NON_FINITE: NON_FINITE, Loss.TOO_LARGE: TOO_LARGE, Loss.MISSING_FIELD: MISSING_FIELD}
-"""Those of `enum loss`."""
+REASONS = {DropReason.NON_FINITE: NON_FINITE, DropReason.TOO_LARGE: TOO_LARGE, DropReason.MISSING_FIELD: MISSING_FIELD}
+"""Those of `enum drop_reason`."""
 
 ONE = b"\0\0\x80\x3f"
 NAN, INF = b"\0\0\xc0\x7f", b"\0\0\x80\x7f"

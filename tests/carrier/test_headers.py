@@ -15,7 +15,7 @@ import pytest
 from router import declared
 from router.carrier import build
 from router.carrier.headers import HeaderError, checks, declarations
-from router.carrier.reasons import LOSSES, REJECTIONS
+from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.table.model import Priority
 
@@ -160,7 +160,7 @@ def test_python_calls_nothing_that_is_not_declared(library: ctypes.CDLL) -> None
 
 def test_reasons_are_named_as_in_metrics() -> None:
     assert tuple(REJECT_REASONS) == REJECTIONS
-    assert {*LOSSES} <= {*DROP_REASONS}
+    assert {*DROP_REASON_NAMES} <= {*DROP_REASONS}
     assert [each.name for each in declared.Priority] == [each.name for each in Priority]
 
 

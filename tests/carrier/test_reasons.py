@@ -13,7 +13,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
-from router.carrier.reasons import LOSSES, REJECTIONS
+from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.rehearsal import Stage
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report
 from router.compiler.program import Program
@@ -260,7 +260,7 @@ WITHOUT_A_STAGE = {
 
 
 def test_every_reason_that_is_counted_is_caused_here() -> None:
-    assert {*DROPPED, *WITHOUT_A_STAGE} == {*LOSSES} == {*DROP_REASONS} - {"loop"}
+    assert {*DROPPED, *WITHOUT_A_STAGE} == {*DROP_REASON_NAMES} == {*DROP_REASONS} - {"loop"}
     assert {*REJECTED} == {*REJECTIONS} == {*REJECT_REASONS}
     assert {*Refused} - {Refused.UNTOLD} == {*_WORDS}
 
@@ -297,7 +297,7 @@ def test_every_loss_has_a_line_with_what_shows_it(reason: str, tmp_path: Path) -
 def test_so_has_every_loss_on_the_way_out(reason: str) -> None:
     names = Names()
     event = WITHOUT_A_STAGE[reason]
-    event.size, event.kind, event.reason = sizeof(event), EventKind.LOST, LOSSES.index(reason)
+    event.size, event.kind, event.reason = sizeof(event), EventKind.LOST, DROP_REASON_NAMES.index(reason)
     event.route, event.target = names.number("gps_info"), names.number("basestation")
     why = b"" if event.error else b"no memory\0"
     reader = EventReader(names, lambda *_: "", lambda *_: "", lambda *_: "")

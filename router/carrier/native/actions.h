@@ -30,7 +30,7 @@ struct action_record {
     int64_t at;            /* wall clock */
     uint32_t route, target; /* as in events; NO_NAME if an endpoint returns, or if a deadman is fed or changes */
     uint32_t topic;         /* that the message came from, or NO_NAME */
-    uint32_t reason;        /* enum loss */
+    uint32_t reason;        /* enum drop_reason */
     int32_t error;          /* errno, or 0 */
     uint32_t length;        /* of what follows */
     struct refusal refusal;

@@ -31,7 +31,7 @@ static bool fits(uint64_t size, uint32_t bound, bool is_fixed) {
 }
 
 static bool too_large(struct check *check, const char *path, uint64_t found, const char *unit, uint32_t bound) {
-    check->refusal->reason = LOSS_TOO_LARGE;
+    check->refusal->reason = DROP_TOO_LARGE;
     snprintf(check->refusal->text, sizeof check->refusal->text, "%s has %llu %s%s; the board takes %u", path,
              (unsigned long long)found, unit, found == 1 ? "" : "s", bound);
     return false;
@@ -46,7 +46,7 @@ static bool takes_number(struct check *check, const struct board_field *field, c
     if (!(field->flags & BOARD_IS_FLOAT) || check->board->allows_non_finite) return true;
     double number = field->kind == WIRE_I64 ? of_float64(load_little_endian(at, 8)) : of_float32(load_little_endian(at, 4));
     if (isfinite(number)) return true;
-    check->refusal->reason = LOSS_NON_FINITE;
+    check->refusal->reason = DROP_NON_FINITE;
     snprintf(check->refusal->text, sizeof check->refusal->text, "%s is %s", field->path,
              isnan(number) ? "nan" : number > 0 ? "inf" : "-inf");
     return false;
@@ -55,7 +55,7 @@ static bool takes_number(struct check *check, const struct board_field *field, c
 static bool takes_integer(struct check *check, const struct board_field *field, uint64_t value) {
     int64_t number = field->flags & BOARD_IS_ZIGZAG ? (int64_t)(value >> 1) ^ -(int64_t)(value & 1) : (int64_t)value;
     if (number >= field->low && number <= field->high) return true;
-    check->refusal->reason = LOSS_TOO_LARGE;
+    check->refusal->reason = DROP_TOO_LARGE;
     long long low = field->low, high = field->high;
     const char *format = low ? "%s is %lld; the board takes %lld to %lld" : "%s is %llu; the board takes %lld to %lld";
     snprintf(check->refusal->text, sizeof check->refusal->text, format, field->path, (long long)number, low, high);
@@ -84,7 +84,7 @@ static bool has_required_fields(struct check *check, const struct level *level) 
     if (!missing) return true;
     const struct board_field *field = level->message->fields;
     while (!(field->required & missing)) field++;
-    check->refusal->reason = LOSS_MISSING_FIELD;
+    check->refusal->reason = DROP_MISSING_FIELD;
     snprintf(check->refusal->text, sizeof check->refusal->text, "%s is missing; the board requires it", field->path);
     return false;
 }

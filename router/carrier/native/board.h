@@ -57,7 +57,7 @@ struct board {
 };
 
 struct board_refusal {
-    enum loss reason; /* LOSS_TOO_LARGE, LOSS_NON_FINITE or LOSS_MISSING_FIELD */
+    enum drop_reason reason; /* DROP_TOO_LARGE, DROP_NON_FINITE or DROP_MISSING_FIELD */
     char text[256];
 };
 

@@ -82,7 +82,7 @@ static void lose_for_all(struct stage *stage, const struct targets *to, int64_t 
 }
 
 static void lose(const struct collector *collector, int64_t now, const char *detail) {
-    lose_for_all(collector->timers->stage, collector->to, now, (struct lost_event){.reason = LOSS_INCOMPLETE}, detail);
+    lose_for_all(collector->timers->stage, collector->to, now, (struct lost_event){.reason = DROP_INCOMPLETE}, detail);
 }
 
 static void lose_large(const struct collector *collector, uint64_t count, int64_t now) {
@@ -372,12 +372,12 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
     struct value by, count, order;
     char detail[LONGEST_DETAIL], numbers[2][24];
     uint32_t at;
-    if (!read_datagram(machine, to->layout, to->sources, message->datagram)) return refuse_value(stage, to, message, LOSS_MAPPING_ERROR);
+    if (!read_datagram(machine, to->layout, to->sources, message->datagram)) return refuse_value(stage, to, message, DROP_MAPPING_ERROR);
     part->name.sender = of->senders[message->datagram->column];
     int outcome = evaluate_value(machine, &of->by, &by, &at);
     if (outcome == EVALUATED && !set_name(&part->name, of, &by)) {
         snprintf(detail, sizeof detail, "'by' of %" PRIu32 " bytes, more than %d", by.size, LONGEST_NAME);
-        return refuse(stage, to, message, LOSS_MAPPING_ERROR, detail);
+        return refuse(stage, to, message, DROP_MAPPING_ERROR, detail);
     }
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->count, &count, &at);
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->order, &order, &at);
@@ -386,7 +386,7 @@ static bool identify(struct stage *stage, const struct targets *to, const struct
         printed(numbers[0], sizeof numbers[0], count.integer, of->signs & FIRST_UNSIGNED);
         printed(numbers[1], sizeof numbers[1], order.integer, of->signs & SECOND_UNSIGNED);
         snprintf(detail, sizeof detail, "a frame of %s has no part %s", numbers[0], numbers[1]);
-        return refuse(stage, to, message, LOSS_MAPPING_ERROR, detail);
+        return refuse(stage, to, message, DROP_MAPPING_ERROR, detail);
     }
     part->count = count.bits;
     part->index = (uint32_t)order.bits; /* has no meaning for a frame that is too large */
@@ -427,6 +427,6 @@ bool collect(struct stage *stage, const struct targets *to, struct message *mess
     const struct frame *frame = take(stage->timers, to->collect->collector, &part, message);
     if (!frame) return false;
     message->is_read = true;
-    message->outcome = read_frame(&stage->machine, to, frame, message->datagram) ? EVALUATED : LOSS_MAPPING_ERROR;
+    message->outcome = read_frame(&stage->machine, to, frame, message->datagram) ? EVALUATED : DROP_MAPPING_ERROR;
     return true;
 }

@@ -77,7 +77,7 @@ static void release(struct timers *timers, struct deferral *deferral, int64_t no
 
 static void offer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
                   int64_t now) {
-    if (deferral->is_held) stage_count(stage->timers->stage, deferral->of.target->dropped[LOSS_RATE_LIMITED], 1);
+    if (deferral->is_held) stage_count(stage->timers->stage, deferral->of.target->dropped[DROP_RATE_LIMITED], 1);
     if (limit_passes(&deferral->limit, now)) {
         forget(stage->timers, deferral);
         pass_on(stage->timers, deferral, data, size, expires, now);

@@ -56,7 +56,7 @@ void lose_refused(struct stage *stage, const struct targets *to, const struct ta
 void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
                 enum refused since) {
     struct refusal refusal = {.kind = since, .values = {now - expires + to->ttl, to->ttl}};
-    lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_STALE, .refusal = refusal}, "");
+    lose_message(stage, to, target, now, (struct lost_event){.reason = DROP_STALE, .refusal = refusal}, "");
 }
 
 /* Report a loss. Returns false. */
@@ -94,7 +94,7 @@ static bool is_readable(const struct delivery *of) {
     struct message *message = of->message;
     if (!message->is_read) {
         bool is_well_formed = read_datagram(&of->stage->machine, of->to->layout, of->to->sources, message->datagram);
-        message->outcome = is_well_formed ? EVALUATED : LOSS_MAPPING_ERROR;
+        message->outcome = is_well_formed ? EVALUATED : DROP_MAPPING_ERROR;
         message->is_read = true;
     }
     return message->outcome == EVALUATED || refuse(of, message->outcome, message->place);
@@ -135,7 +135,7 @@ static bool is_fresh(const struct delivery *of) {
 static bool keeps_rate(const struct delivery *of) {
     struct limit *const *limits = of->target->limits;
     if (!limits || limit_passes(limits[source_of(of->message)], of->message->now)) return true;
-    count(of, of->target->dropped[LOSS_RATE_LIMITED]);
+    count(of, of->target->dropped[DROP_RATE_LIMITED]);
     return false;
 }
 
@@ -163,15 +163,15 @@ static size_t trimmed_size(const uint8_t *data, size_t size) {
     return envelope_restored_size(data, trimmed) == size ? trimmed : size;
 }
 
-static enum loss loss_of(int error) {
+static enum drop_reason drop_reason_of(int error) {
     bool is_full = error == EAGAIN || error == EWOULDBLOCK || error == ENOBUFS;
-    return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
+    return is_full ? DROP_SEND_BUFFER_FULL : DROP_SEND_ERROR;
 }
 
 static void lose_unsent(struct stage *stage, const struct targets *to, const struct target *target, int64_t expires,
                         int64_t now, int error) {
     if (error == COMMAND_STALE) lose_stale(stage, to, target, stage->now(stage), expires, REFUSED_WAITING);
-    else lose_message(stage, to, target, now, (struct lost_event){.reason = loss_of(error), .error = error}, "");
+    else lose_message(stage, to, target, now, (struct lost_event){.reason = drop_reason_of(error), .error = error}, "");
 }
 
 static bool publish_it(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
@@ -179,7 +179,7 @@ static bool publish_it(struct stage *stage, const struct targets *to, const stru
     switch (stage->publish(stage, target, &why)) {
     case PUBLISHED: stage_count(stage, target->delivered, 1); return true;
     case PUBLISH_FAILED:
-        lose_message(stage, to, target, now, (struct lost_event){.reason = LOSS_PUBLISH_ERROR}, why);
+        lose_message(stage, to, target, now, (struct lost_event){.reason = DROP_PUBLISH_ERROR}, why);
         return true;
     default: return false;
     }

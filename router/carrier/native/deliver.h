@@ -55,7 +55,7 @@ struct target {
     uint32_t id;    /* in events */
     /* Counters. `waiting` is for a target whose messages pass a ring, `collected` for one that gets frames,
      * `delivered_bytes` for a destination. */
-    uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[LOSSES];
+    uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[DROP_REASONS];
 };
 
 /* The first slots of every layout of datagrams. */
@@ -94,7 +94,7 @@ struct message {
     struct time_range times;         /* of the event `since` */
     enum refused since;              /* the event that its age counts from */
     bool is_read;
-    int outcome;    /* result of reading: EVALUATED, or an enum loss */
+    int outcome;    /* result of reading: EVALUATED, or an enum drop_reason */
     uint32_t place; /* where it was refused: enum place */
 };
 

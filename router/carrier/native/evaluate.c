@@ -97,7 +97,7 @@ static void explain(struct machine *machine, const struct operation *op, const s
 
 static int outcome_of(const struct refusal *refusal) {
     bool is_finite = refusal->kind != REFUSED_REAL || isfinite(of_float64((uint64_t)refusal->values[0]));
-    return is_finite ? LOSS_MAPPING_ERROR : LOSS_NON_FINITE;
+    return is_finite ? DROP_MAPPING_ERROR : DROP_NON_FINITE;
 }
 
 /* ---- execution ---- */

@@ -9,7 +9,7 @@
 
 enum { EVALUATED = -1 };
 
-/* These return EVALUATED, or the reason why the message is refused, an enum loss (events.h); `at` is then the index of the
+/* These return EVALUATED, or why the message is refused, an enum drop_reason (events.h); `at` is then the index of the
  * operation that refused it. Cells and text of a routine are freed when it ends. */
 
 /* Evaluate a condition. */

@@ -90,8 +90,8 @@ struct refusal {
 struct lost_event {
     uint32_t size, kind; /* EVENT_LOST; a text with details may follow, up to a NUL */
     uint32_t route, topic, target; /* `topic`: of the message from ROS, or NO_NAME */
-    uint32_t reason;     /* enum loss */
-    int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
+    uint32_t reason;     /* enum drop_reason */
+    int32_t error;       /* errno, of DROP_SEND_BUFFER_FULL and DROP_SEND_ERROR */
     uint32_t counter;    /* of such losses */
     uint32_t generation; /* of the program, if `place` in it refused the message */
     uint32_t place;
@@ -108,20 +108,20 @@ enum place {
 };
 
 /* Why a target did not get a message: DROP_REASONS in compiler/metrics.py. */
-enum loss {
-    LOSS_MAPPING_ERROR,
-    LOSS_NON_FINITE,
-    LOSS_STALE,
-    LOSS_RATE_LIMITED,
-    LOSS_QUEUE_FULL,
-    LOSS_SEND_BUFFER_FULL,
-    LOSS_SEND_ERROR,
-    LOSS_PUBLISH_ERROR,
-    LOSS_TOO_LARGE,
-    LOSS_INCOMPLETE,
-    LOSS_SUPERSEDED,
-    LOSS_MISSING_FIELD
+enum drop_reason {
+    DROP_MAPPING_ERROR,
+    DROP_NON_FINITE,
+    DROP_STALE,
+    DROP_RATE_LIMITED,
+    DROP_QUEUE_FULL,
+    DROP_SEND_BUFFER_FULL,
+    DROP_SEND_ERROR,
+    DROP_PUBLISH_ERROR,
+    DROP_TOO_LARGE,
+    DROP_INCOMPLETE,
+    DROP_SUPERSEDED,
+    DROP_MISSING_FIELD
 };
-enum { LOSSES = LOSS_MISSING_FIELD + 1 };
+enum { DROP_REASONS = DROP_MISSING_FIELD + 1 };
 
 #endif

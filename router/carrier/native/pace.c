@@ -147,7 +147,7 @@ static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
     const struct waiting_datagram *oldest = take_off(pacer, &pacer->lanes[lowest]);
     const struct route_target *of = oldest->of;
     if (oldest->expires == SUPERSEDED) return;
-    lose_message(timers->stage, of->to, of->target, now, (struct lost_event){.reason = LOSS_QUEUE_FULL}, "");
+    lose_message(timers->stage, of->to, of->target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
 }
 
 /* ---- the timer ---- */
@@ -228,7 +228,7 @@ void pacer_supersede(struct timers *timers, struct pacer *pacer, const struct ro
 }
 
 void lose_superseded(struct stage *stage, const struct route_target *of, int64_t now) {
-    lose_message(stage, of->to, of->target, now, (struct lost_event){.reason = LOSS_SUPERSEDED}, "");
+    lose_message(stage, of->to, of->target, now, (struct lost_event){.reason = DROP_SUPERSEDED}, "");
 }
 
 struct pacer *pacer_open(int64_t bandwidth) {

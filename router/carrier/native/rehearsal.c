@@ -216,18 +216,18 @@ static int evaluate_on_payload(struct machine *machine, const struct layout *lay
                                const struct value *source, int64_t received_at, const void *payload, size_t size,
                                bool *holds) {
     uint32_t at;
-    if (!machine_open(machine)) return LOSSES;
+    if (!machine_open(machine)) return DROP_REASONS;
     machine_begin(machine, layout);
     machine->slots[SLOT_RECEIVED_AT].integer = received_at;
     machine->slots[SLOT_SOURCE] = *source;
-    if (!machine_read(machine, payload, size)) return LOSS_MAPPING_ERROR;
+    if (!machine_read(machine, payload, size)) return DROP_MAPPING_ERROR;
     return evaluate_condition(machine, condition, holds, &at);
 }
 
 int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
                     int64_t received_at, const void *payload, size_t size, bool *holds) {
     struct machine *machine = calloc(1, sizeof *machine);
-    if (!machine) return LOSSES;
+    if (!machine) return DROP_REASONS;
     int outcome = evaluate_on_payload(machine, layout, condition, source, received_at, payload, size, holds);
     machine_close(machine);
     free(machine);

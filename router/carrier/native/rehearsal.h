@@ -66,8 +66,8 @@ void rehearsal_end(struct rehearsal *rehearsal);
  * memory runs out. */
 const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size);
 
-/* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender. Return EVALUATED, an enum
- * loss if it has no value for this payload or the payload is malformed, or LOSSES if memory runs out. */
+/* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender. Return EVALUATED, an
+ * enum drop_reason if it has no value for this payload or the payload is malformed, or DROP_REASONS if memory runs out. */
 int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
                     int64_t received_at, const void *payload, size_t size, bool *holds);
 

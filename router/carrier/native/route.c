@@ -64,7 +64,7 @@ static void drop_oldest(struct routing *routing, int64_t now) {
     for (uint32_t index = 0; index < oldest.to->count; index++) {
         const struct target *target = &oldest.to->targets[index];
         stage_count(&routing->stage, target->waiting, -1);
-        lose_message(&routing->stage, oldest.to, target, now, (struct lost_event){.reason = LOSS_QUEUE_FULL}, "");
+        lose_message(&routing->stage, oldest.to, target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
     }
 }
 

@@ -54,7 +54,7 @@ static void serve_element(struct ros_routing *routing, const struct ros_route *r
     struct value item = list_next(machine, list, each->stored);
     if (each->index != NONE) machine->slots[each->index].integer = index;
     if (each->section == NONE) machine->slots[each->item] = item;
-    else if (!machine_enter(machine, each->section, &item)) message.outcome = LOSS_MAPPING_ERROR;
+    else if (!machine_enter(machine, each->section, &item)) message.outcome = DROP_MAPPING_ERROR;
     deliver_to_all(&routing->stage, &route->targets, &message);
     machine->cell_count = cell_count;
 }
@@ -69,7 +69,7 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
     message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
     if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) {
         machine_refuse(machine, (struct refusal){.kind = REFUSED_MOST, .values = {list.size, MOST_ELEMENTS}});
-        message->outcome = LOSS_MAPPING_ERROR;
+        message->outcome = DROP_MAPPING_ERROR;
     }
     if (message->outcome != EVALUATED) {
         deliver_to_all(&routing->stage, &route->targets, message);
@@ -116,7 +116,7 @@ void route_ros(struct ros_routing *routing, const struct ros_route *route, const
     if (route->targets.ttl) message.times = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
     machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
-    if (!machine_read(machine, taken->data, taken->size)) message.outcome = LOSS_MAPPING_ERROR;
+    if (!machine_read(machine, taken->data, taken->size)) message.outcome = DROP_MAPPING_ERROR;
     else if (route->targets.ttl) date_by_stamp(routing, route, taken, &message);
     if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
     else deliver_to_all(&routing->stage, &route->targets, &message);

@@ -22,7 +22,7 @@ static const uint32_t senders[] = {7, 9};
 static struct collect collects = {.by = {by, 1, 0}, .count = {count, 1, 0}, .order = {place, 1, 0}, .senders = senders,
                                   .signs = FIRST_UNSIGNED | SECOND_UNSIGNED, .items = ITEMS, .counted = COUNTED};
 static const struct target only = {.filtered = FILTERED, .collected = COLLECTED,
-                                   .dropped = {[LOSS_INCOMPLETE] = INCOMPLETE, [LOSS_MAPPING_ERROR] = REFUSED}};
+                                   .dropped = {[DROP_INCOMPLETE] = INCOMPLETE, [DROP_MAPPING_ERROR] = REFUSED}};
 static const struct targets to = {.layout = &layout, .sources = sources, .collect = &collects, .targets = &only, .count = 1,
                                   .topic = NO_NAME};
 static counter counters[COUNTERS];

@@ -22,7 +22,7 @@ static struct deferral *deferrals[2][COLUMNS];
 static const uint8_t wanted = 1;
 static const struct topic topic = {.wanted = &wanted};
 static const struct target published = {
-    .topic = &topic, .waiting = WAITING, .filtered = FILTERED, .dropped = {[LOSS_QUEUE_FULL] = QUEUE_FULL}};
+    .topic = &topic, .waiting = WAITING, .filtered = FILTERED, .dropped = {[DROP_QUEUE_FULL] = QUEUE_FULL}};
 static struct sender nowhere = {.fd = -1};
 /* A condition on the first field that every payload may have. */
 static const struct wanted_field fields[] = {{.number = 1, .type = TYPE_INT32, .slot = 2, .presence = NONE, .section = NONE,
@@ -35,14 +35,14 @@ static const struct operation condition[] = {{.kind = OP_INTEGER, .integer = 6},
 
 static struct target destinations[] = {
     {.sender = &nowhere, .limits = limits, .trims = 1, .delivered = SENT, .delivered_bytes = SENT_BYTES,
-     .dropped = {[LOSS_STALE] = STALE, [LOSS_RATE_LIMITED] = LIMITED, [LOSS_SEND_BUFFER_FULL] = FULL,
-                 [LOSS_SEND_ERROR] = FAILED}},
+     .dropped = {[DROP_STALE] = STALE, [DROP_RATE_LIMITED] = LIMITED, [DROP_SEND_BUFFER_FULL] = FULL,
+                 [DROP_SEND_ERROR] = FAILED}},
     {.sender = &nowhere, .condition = {condition, 3, 0}, .filtered = UNMET,
-     .dropped = {[LOSS_MAPPING_ERROR] = REFUSED, [LOSS_STALE] = MET, [LOSS_SEND_ERROR] = MET}},
+     .dropped = {[DROP_MAPPING_ERROR] = REFUSED, [DROP_STALE] = MET, [DROP_SEND_ERROR] = MET}},
     {.sender = &nowhere, .trims = 1, .priority = PRIORITY_BULK,
-     .dropped = {[LOSS_STALE] = PACED, [LOSS_QUEUE_FULL] = PACED, [LOSS_SEND_ERROR] = PACED}},
+     .dropped = {[DROP_STALE] = PACED, [DROP_QUEUE_FULL] = PACED, [DROP_SEND_ERROR] = PACED}},
     {.sender = &nowhere, .period = 1000000,
-     .dropped = {[LOSS_STALE] = HELD, [LOSS_RATE_LIMITED] = HELD, [LOSS_SEND_ERROR] = HELD}}};
+     .dropped = {[DROP_STALE] = HELD, [DROP_RATE_LIMITED] = HELD, [DROP_SEND_ERROR] = HELD}}};
 static const struct route only = {
     .sends = {.ttl = 1000000000, .layout = &layout, .sources = sources, .targets = destinations, .count = 4,
               .topic = NO_NAME},

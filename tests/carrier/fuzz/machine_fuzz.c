@@ -30,7 +30,7 @@ int LLVMFuzzerInitialize(int *count, char ***arguments) {
 }
 
 static void demand_order(int outcome, uint32_t at, uint32_t count) {
-    demand(outcome == EVALUATED || outcome == LOSS_MAPPING_ERROR || outcome == LOSS_NON_FINITE);
+    demand(outcome == EVALUATED || outcome == DROP_MAPPING_ERROR || outcome == DROP_NON_FINITE);
     demand(outcome == EVALUATED || at < count);
     demand(machine.cell_count <= machine.cell_capacity && machine.text_size <= MOST_TEXT);
     demand(machine.output.size <= machine.output.capacity);
@@ -60,7 +60,7 @@ static int make_for_each(const struct fuzzed *chosen) {
     for (cell_count = machine.cell_count; list.size; machine.cell_count = cell_count) {
         struct value element = list_next(&machine, &list, chosen->stored);
         if (chosen->section == NONE) machine.slots[chosen->item] = element;
-        else if (!machine_enter(&machine, chosen->section, &element)) return LOSS_MAPPING_ERROR;
+        else if (!machine_enter(&machine, chosen->section, &element)) return DROP_MAPPING_ERROR;
         outcome = make(chosen);
     }
     return outcome;
@@ -73,7 +73,7 @@ static int run(const struct fuzzed *chosen, bool is_in_pieces, const uint8_t *da
     memset(machine.slots + chosen->layout.slot_count, 0xa5, sizeof *machine.slots); /* nobody is to use it */
     machine.slots[RECEIVED_AT].integer = 1700000000123456789;
     machine.slots[SOURCE] = (struct value){.bytes = (const uint8_t *)"a board", .size = 7};
-    if (!(is_in_pieces ? machine_read_pieces : machine_read)(&machine, data, size)) return LOSS_MAPPING_ERROR;
+    if (!(is_in_pieces ? machine_read_pieces : machine_read)(&machine, data, size)) return DROP_MAPPING_ERROR;
     return chosen->list.count ? make_for_each(chosen) : make(chosen);
 }
 

@@ -57,7 +57,7 @@ int main(void) {
     struct feed feed = {.deadman = deadman, .to = 1};
     struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,
                             .delivered = SENT, .delivered_bytes = BYTES};
-    for (int reason = 0; reason < LOSSES; reason++) target.dropped[reason] = LOST;
+    for (int reason = 0; reason < DROP_REASONS; reason++) target.dropped[reason] = LOST;
     struct ros_route route = {
         .targets = {.ttl = 1000000000, .layout = &LAYOUT, .targets = &target, .count = 1, .topic = NO_NAME},
         .seconds = NONE, .nanoseconds = NONE, .received = RECEIVED, .last_message = LAST, .duration = DURATION};

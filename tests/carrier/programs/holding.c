@@ -11,8 +11,8 @@
 #include "clock.h"
 #include "defer.h"
 
-enum { OFFERING = 3, TARGETS = 4, COUNTERS = 2 + LOSSES, LONGEST = 3000, BANDWIDTH = 2000000 };
-enum { DELIVERED, BYTES, FIRST_LOSS };
+enum { OFFERING = 3, TARGETS = 4, COUNTERS = 2 + DROP_REASONS, LONGEST = 3000, BANDWIDTH = 2000000 };
+enum { DELIVERED, BYTES, FIRST_DROP };
 
 /* Targets of one program: of each, its deferral, which it may have in common with the program before. */
 struct program {
@@ -60,7 +60,7 @@ static struct program *open_program(struct program *earlier, unsigned *random) {
         *target = (struct target){.delivered = DELIVERED, .delivered_bytes = BYTES, .priority = index % PRIORITIES};
         target->period = index % 2 ? 1000 * (1 + rand_r(random) % 100) : 0;
         if (keeps && rand_r(random) % 2) target->period = earlier->targets[index].period;
-        for (uint32_t reason = 0; reason < LOSSES; reason++) target->dropped[reason] = FIRST_LOSS + reason;
+        for (uint32_t reason = 0; reason < DROP_REASONS; reason++) target->dropped[reason] = FIRST_DROP + reason;
         made->deferrals[index] = keeps ? earlier->deferrals[index] : deferral_open(index == 3 ? NULL : pacer);
         check(made->deferrals[index], "memory");
     }
@@ -164,10 +164,10 @@ int main(int count, char **arguments) {
     timers_end(timers);
     check(!timers->first, "nothing waits at the end");
     int64_t dropped = 0;
-    for (int reason = 0; reason < LOSSES; reason++) dropped += counters[FIRST_LOSS + reason];
+    for (int reason = 0; reason < DROP_REASONS; reason++) dropped += counters[FIRST_DROP + reason];
     check(counters[DELIVERED] + dropped == offered, "each message is counted once");
-    check(counters[FIRST_LOSS + LOSS_SEND_ERROR] == refused, "what is refused is counted so");
-    check(counters[FIRST_LOSS + LOSS_RATE_LIMITED] && counters[FIRST_LOSS + LOSS_STALE], "messages are held");
+    check(counters[FIRST_DROP + DROP_SEND_ERROR] == refused, "what is refused is counted so");
+    check(counters[FIRST_DROP + DROP_RATE_LIMITED] && counters[FIRST_DROP + DROP_STALE], "messages are held");
     printf("offered %lld, delivered %lld, %u programs\n", (long long)offered, (long long)counters[DELIVERED],
            atomic_load(&current)->generation);
     struct program *last = atomic_load(&current);

@@ -97,12 +97,12 @@ static void make_target(struct made *made, int index) {
         .condition = {made->operations + 1, (uint32_t)index, 0}, .limits = index ? limits : NULL,
         .delivered = topic_counter(index, PUBLICATIONS), .waiting = topic_counter(index, WAITING),
         .filtered = topic_counter(index, FILTERED)};
-    for (int reason = 0; reason < LOSSES; reason++) made->targets[index].dropped[reason] = topic_counter(index, MAPPING);
-    made->targets[index].dropped[LOSS_QUEUE_FULL] = topic_counter(index, QUEUE_FULL);
-    made->targets[index].dropped[LOSS_STALE] = topic_counter(index, STALE);
-    made->targets[index].dropped[LOSS_RATE_LIMITED] = topic_counter(index, LIMITED);
-    made->targets[index].dropped[LOSS_NON_FINITE] = topic_counter(index, NON_FINITE);
-    made->targets[index].dropped[LOSS_PUBLISH_ERROR] = topic_counter(index, REFUSED);
+    for (int reason = 0; reason < DROP_REASONS; reason++) made->targets[index].dropped[reason] = topic_counter(index, MAPPING);
+    made->targets[index].dropped[DROP_QUEUE_FULL] = topic_counter(index, QUEUE_FULL);
+    made->targets[index].dropped[DROP_STALE] = topic_counter(index, STALE);
+    made->targets[index].dropped[DROP_RATE_LIMITED] = topic_counter(index, LIMITED);
+    made->targets[index].dropped[DROP_NON_FINITE] = topic_counter(index, NON_FINITE);
+    made->targets[index].dropped[DROP_PUBLISH_ERROR] = topic_counter(index, REFUSED);
 }
 
 static struct made *make(const struct round *stage, uint32_t generation) {

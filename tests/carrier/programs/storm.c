@@ -127,10 +127,10 @@ static struct target make_destination(const struct made *made, int route, int to
         .sender = senders[to], .limits = to == 1 ? limits : NULL, .feeds = &made->feed, .feed_count = to == 0,
         .condition = {&made->condition, to == 1, 0}, .trims = to == 1, .id = (uint32_t)to,
         .delivered = destination_counter(route, to, SENT), .delivered_bytes = destination_counter(route, to, SENT_BYTES)};
-    target.dropped[LOSS_STALE] = destination_counter(route, to, STALE);
-    target.dropped[LOSS_RATE_LIMITED] = destination_counter(route, to, LIMITED);
-    target.dropped[LOSS_SEND_BUFFER_FULL] = destination_counter(route, to, FULL);
-    target.dropped[LOSS_SEND_ERROR] = destination_counter(route, to, ERROR);
+    target.dropped[DROP_STALE] = destination_counter(route, to, STALE);
+    target.dropped[DROP_RATE_LIMITED] = destination_counter(route, to, LIMITED);
+    target.dropped[DROP_SEND_BUFFER_FULL] = destination_counter(route, to, FULL);
+    target.dropped[DROP_SEND_ERROR] = destination_counter(route, to, ERROR);
     return target;
 }
 
@@ -138,7 +138,7 @@ static void make_route(struct made *made, int index) {
     for (int to = 0; to < DESTINATIONS; to++) made->destinations[index][to] = make_destination(made, index, to);
     made->topics[index] = (struct target){.topic = &made->topic, .id = 7, .waiting = route_counter(index, WAITING),
                                           .filtered = route_counter(index, FILTERED)};
-    made->topics[index].dropped[LOSS_QUEUE_FULL] = route_counter(index, QUEUE_FULL);
+    made->topics[index].dropped[DROP_QUEUE_FULL] = route_counter(index, QUEUE_FULL);
     struct targets sends = {.ttl = index ? 20000000 : 0, .layout = &made->layout, .sources = made->sources,
                             .targets = made->destinations[index], .count = DESTINATIONS, .route = (uint32_t)index,
                             .topic = NO_NAME};
