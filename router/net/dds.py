@@ -40,10 +40,10 @@ def clashes(program: Program, variables: Mapping[str, str]) -> Iterator[Clash]:
     """Yield the UDP addresses of listeners and gateways with a port of DDS in the domain of the environment."""
     if (domain := _domain(variables)) is None:
         return
-    found = [(f"listener '{each.name}'", each.address) for each in program.listeners]
+    addresses = [(f"listener '{listener.name}'", listener.address) for listener in program.listeners]
     for name, gateway in program.table.gateways.items():
-        found += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
-    for owner, address in found:
+        addresses += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
+    for owner, address in addresses:
         if is_of_ros(address.value.port, variables):
             blinds = address.value.port == _FIRST + _OF_DOMAIN * domain
             yield Clash(owner, address.span, address.value, domain, blinds)

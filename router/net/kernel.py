@@ -236,7 +236,7 @@ def _process(protocol: str, port: int) -> Path | None:
 
     wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
     processes = Path("/proc").glob("[0-9]*")
-    return next((each for each in processes if not wanted.isdisjoint(_open_files(each))), None)
+    return next((process for process in processes if not wanted.isdisjoint(_open_files(process))), None)
 
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:

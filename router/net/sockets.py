@@ -209,7 +209,9 @@ def placed(source: Source | None, every: Iterable[Source]) -> Source | None:
     """Return the listener to send from; while it is waiting, another one with the same address and port."""
     if source is None or not source.is_waiting:
         return source
-    return next((each for each in every if each.address == source.address and not each.is_waiting), source)
+    return next(
+        (listener for listener in every if listener.address == source.address and not listener.is_waiting), source
+    )
 
 
 def open_sending(
@@ -243,7 +245,7 @@ def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]
     datagrams: Linux prefers such sockets.
     """
     everywhere = "0.0.0.0", source.address[1]
-    return everywhere if any(each.address == everywhere for each in listening) else source.address
+    return everywhere if any(listener.address == everywhere for listener in listening) else source.address
 
 
 def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
@@ -269,9 +271,9 @@ def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         host, port = address_beside(source, listening)
         with ExitStack() as shared:
-            for each in listening:
-                if each.address[1] == port:
-                    shared.enter_context(each.shared())
+            for listener in listening:
+                if listener.address[1] == port:
+                    shared.enter_context(listener.shared())
             opened.bind((f"::ffff:{host}", port))
     except OSError:
         opened.close()
