@@ -93,7 +93,7 @@ def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
 def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
     """Return the largest encoding of a message without one of its oneofs. Fields without a bound do not count."""
     message = oneof.containing_type
-    unbounded = {found.path[0] for found in unbounded_fields(message, options_of)}
+    unbounded = {field.path[0] for field in unbounded_fields(message, options_of)}
     members = {*oneof.fields, *unbounded}
     return _size_of([field for field in message.fields if field not in members], options_of)
 
@@ -202,7 +202,7 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
         hint = f"see {schema.span(schema.envelope, case.name)}; remove `type:FT_IGNORE`"
         return [Diagnostic(span, Code.BOARD_PAYLOAD, message, hint)]
     unbounded = unbounded_fields(schema.descriptor(case.type.name), schema.board_options)
-    findings = [_unbounded_finding(case, found, schema, span) for found in unbounded]
+    findings = [_unbounded_finding(case, field, schema, span) for field in unbounded]
     if case.max_size is not None and (size := framed_size(case.number, case.max_size)) > limit:
         message = f"an envelope with {case.name} takes up to {size} bytes; boards reject more than {limit}"
         hint = f"see {schema.span(case.type.name)}; make the message smaller, or flash the boards and lock the new size"
@@ -210,15 +210,15 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
     return findings
 
 
-def _unbounded_finding(case: PayloadCase, found: Unbounded, schema: ProtoSchema, span: SourceSpan) -> Diagnostic:
-    field = found.path[-1]
-    path = ".".join((case.name, *(step.name for step in found.path)))
+def _unbounded_finding(case: PayloadCase, unbounded: Unbounded, schema: ProtoSchema, span: SourceSpan) -> Diagnostic:
+    field = unbounded.path[-1]
+    path = ".".join((case.name, *(step.name for step in unbounded.path)))
     place = schema.span(container(field).full_name, field.name)
-    option = found.why.partition(" without a ")[2]
+    option = unbounded.why.partition(" without a ")[2]
     remedy = ""
     if option:
         remedy = f"; write `{field.full_name} {option}:N` into a nanopb .options file beside the .proto"
-    elif "_override" in found.why or "pointer or callback" in found.why:
+    elif "_override" in unbounded.why or "pointer or callback" in unbounded.why:
         remedy = "; remove that option"
     hint = f"see {place}{remedy}"
-    return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot decode {path}: it {found.why}", hint)
+    return Diagnostic(span, Code.BOARD_PAYLOAD, f"a board cannot decode {path}: it {unbounded.why}", hint)

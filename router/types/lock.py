@@ -146,13 +146,13 @@ class LockComparison:
         live = [entry for entry in by_number(locked) if not any(entry.number in span for span in reserved)]
         moved = set()
         for entry in by_number(current):
-            holders = [each for each in live if each.number == entry.number]
-            if any(each.name == entry.name for each in holders):
-                self._compare_types(owner, next(each for each in holders if each.name == entry.name), entry)
-            elif any(each.name == entry.name for each in live):
+            holders = [old for old in live if old.number == entry.number]
+            if any(old.name == entry.name for old in holders):
+                self._compare_types(owner, next(old for old in holders if old.name == entry.name), entry)
+            elif any(old.name == entry.name for old in live):
                 moved.add(entry.name)
-                self._refuse_number(owner, [each for each in live if each.name == entry.name], entry, holders)
-            elif holders and not any((each.number, each.name) in _names(current) for each in holders):
+                self._refuse_number(owner, [old for old in live if old.name == entry.name], entry, holders)
+            elif holders and not any((old.number, old.name) in _names(current) for old in holders):
                 self._refuse_holder(owner, holders[0], entry)
             elif any(first <= entry.number <= last for first, last in locked.reserved):
                 message = f"number {entry.number} of {owner} is reserved, but used for '{entry.name}'"
@@ -194,9 +194,9 @@ class LockComparison:
         self._refuse(owner, new.name, span, message, hint, {*holders, *olds})
 
     def _refuse_holder(self, owner: str, holder: Entry, new: Entry) -> None:
-        was, now = (f"'{each.name}'" for each in (holder, new))
+        was, now = (f"'{member.name}'" for member in (holder, new))
         if holder.type != new.type:
-            was, now = (f"'{each.type} {each.name}'" for each in (holder, new))
+            was, now = (f"'{member.type} {member.name}'" for member in (holder, new))
         message = f"number {new.number} of {owner} belongs to {was}, not to {now}"
         hint = f"{_restore(holder)}, or reserve {new.number} and use a free number"
         self._refuse(owner, new.name, self._span(owner, new, Part.NUMBER), message, hint, {holder})

@@ -83,7 +83,7 @@ def lock_text(lock: Lock) -> str:
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
-            name: _declaration(message, "fields", {str(each.number): _field(each) for each in by_number(message)})
+            name: _declaration(message, "fields", {str(entry.number): _field(entry) for entry in by_number(message)})
             for name, message in sorted(lock.messages.items())
         },
         "enums": {
@@ -153,8 +153,8 @@ def _parsed(content: Any) -> Lock:
         message=str(envelope["message"]),
         oneof=str(envelope["oneof"]),
         max_size=int(envelope["max_size"]),
-        messages={name: _declared(each, "fields", _field_entries) for name, each in content["messages"].items()},
-        enums={name: _declared(each, "values", _value_entries) for name, each in content["enums"].items()},
+        messages={name: _declared(message, "fields", _field_entries) for name, message in content["messages"].items()},
+        enums={name: _declared(enum, "values", _value_entries) for name, enum in content["enums"].items()},
     )
 
 
@@ -171,9 +171,9 @@ def _range(text: str) -> tuple[int, int]:
 
 def _field_entries(fields: Mapping[str, str]) -> Iterator[Entry]:
     for number, declared in fields.items():
-        if (found := _FIELD.fullmatch(declared)) is None:
+        if (parts := _FIELD.fullmatch(declared)) is None:
             raise ValueError(f"'{number}: {declared}' is not a number, a type and a name")
-        yield Entry(int(number), found["name"], found["type"], found["oneof"] or "")
+        yield Entry(int(number), parts["name"], parts["type"], parts["oneof"] or "")
 
 
 def _value_entries(values: Mapping[str, str]) -> Iterator[Entry]:

@@ -148,20 +148,20 @@ class _Line:
             raise self.error(str(error), text) from None
 
     def _field_type(self, package: str) -> Type:
-        found = _TYPE.fullmatch(self._type)
-        if found is None:
+        parts = _TYPE.fullmatch(self._type)
+        if parts is None:
             raise self.error(f"'{self._type}' is not a type", self._type)
-        element = PRIMITIVES.get(found["base"])
+        element = PRIMITIVES.get(parts["base"])
         if isinstance(element, String):
-            element = String(_number(found["string_bound"]), element.wide)
-        elif found["string_bound"]:
+            element = String(_number(parts["string_bound"]), element.wide)
+        elif parts["string_bound"]:
             raise self.error(f"'{self._type}' is not a type; only strings have a bound", self._type)
         elif element is None:
-            named = _MESSAGE_NAME.fullmatch(found["base"])
+            named = _MESSAGE_NAME.fullmatch(parts["base"])
             if named is None:
                 raise self.error(f"'{self._type}' is not a type", self._type)
             element = MessageType(f"{named['package'] or package}/msg/{named['name']}")
-        return List(element, _number(found["length"]), _number(found["bound"])) if found["array"] else element
+        return List(element, _number(parts["length"]), _number(parts["bound"])) if parts["array"] else element
 
 
 def _number(digits: str | None) -> int | None:

@@ -292,7 +292,7 @@ class NanopbOptions:
             return None
         declared = DescriptorProto()
         message.CopyToProto(declared)
-        if any(each.name == field.name and each.proto3_optional for each in declared.field):
+        if any(member.name == field.name and member.proto3_optional for member in declared.field):
             return None
         return self._merged(around, message, oneof.name, message.GetOptions())
 

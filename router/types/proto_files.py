@@ -62,7 +62,9 @@ def _meant(root: Path, blame: SourceSpan) -> str:
     if inputs.is_file(path):
         return "that is a file: name its folder"
     beside_table = path.parent.parent / path.name  # of a table in routes/
-    near = next((each for each in (nearest_path(path), beside_table) if each is not None and inputs.is_dir(each)), None)
+    near = next(
+        (folder for folder in (nearest_path(path), beside_table) if folder is not None and inputs.is_dir(folder)), None
+    )
     if near is None:
         return "paths are relative to the table"
     return f"did you mean '{Path(os.path.relpath(near, Path(inputs.real_path(blame.file)).parent)).as_posix()}'?"
@@ -76,13 +78,13 @@ def read_folder(root: Path, blame: SourceSpan, exclude: Sequence[Located[str]] =
     """
     if not inputs.is_dir(root):
         raise TableError.of(blame, Code.BAD_FILE, f"there is no folder {inputs.real_path(root)}", _meant(root, blame))
-    found = {path.relative_to(root).as_posix(): path for path in walk(root) if path.suffix in (PROTO, OPTIONS)}
-    if not any(name.endswith(PROTO) for name in found):
+    paths = {path.relative_to(root).as_posix(): path for path in walk(root) if path.suffix in (PROTO, OPTIONS)}
+    if not any(name.endswith(PROTO) for name in paths):
         raise TableError.of(blame, Code.BAD_FILE, f"{shown_path(root)} contains no .proto file")
-    excluded = _excluded(root, found, exclude)
+    excluded = _excluded(root, paths, exclude)
     files = {}
     faults: dict[str, Sequence[Diagnostic]] = {}
-    for name, path in sorted(found.items()):
+    for name, path in sorted(paths.items()):
         if name in excluded:
             continue
         if not _FILE_NAME.fullmatch(name):
@@ -106,14 +108,14 @@ def _excluded(root: Path, names: Iterable[str], exclude: Sequence[Located[str]])
     """
     excluded: dict[str, Located[str]] = {}
     findings = []
-    for each in exclude:
-        written = each.value.rstrip("/")
+    for entry in exclude:
+        written = entry.value.rstrip("/")
         covered = [name for name in names if written in (proto_of(name), name) or name.startswith(f"{written}/")]
-        excluded.update(dict.fromkeys(covered, each))
+        excluded.update(dict.fromkeys(covered, entry))
         if not covered:
             hint = _exclude_hint(written, [name for name in names if name.endswith(PROTO)])
-            what = f"{shown_path(root)} has no file or folder '{each.value}' to exclude"
-            findings.append(Diagnostic(each.span, Code.BAD_FILE, what, hint))
+            what = f"{shown_path(root)} has no file or folder '{entry.value}' to exclude"
+            findings.append(Diagnostic(entry.span, Code.BAD_FILE, what, hint))
     if findings:
         raise TableError(findings)
     return excluded
@@ -138,7 +140,7 @@ def walk(root: Path) -> Iterator[Path]:
         folder = waiting.pop()
         seen.add(inputs.real_path(folder))
         names, files = inputs.listing(folder)
-        inner = [each for name in names if inputs.real_path(each := folder / name) not in seen]
+        inner = [path for name in names if inputs.real_path(path := folder / name) not in seen]
         yield from (*inner, *(folder / name for name in files))
         waiting += reversed(inner)
 
@@ -233,12 +235,12 @@ def declaring(name: str, files: Mapping[str, bytes]) -> list[tuple[str, str]]:
 
 def reached(start: str, files: Mapping[str, bytes]) -> set[str]:
     """Return the file and all that it imports, directly or indirectly, existing or not."""
-    found: set[str] = set()
+    seen: set[str] = set()
     waiting: Iterable[str] = [start]
     while waiting:
-        found.update(waiting)
-        waiting = {name for file in waiting for name in scan(files.get(file, b"")).imports} - found
-    return found
+        seen.update(waiting)
+        waiting = {name for file in waiting for name in scan(files.get(file, b"")).imports} - seen
+    return seen
 
 
 _FURTHER_UP = 4
@@ -252,24 +254,24 @@ def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], 
     """
     wanted = message.value
     declared = declaring(wanted, folder.protos)
-    found = [(file, name) for file, name in declared if name in scan(folder.files[file]).messages]
-    if not found:
+    declarations = [(file, name) for file, name in declared if name in scan(folder.files[file]).messages]
+    if not declarations:
         raise TableError(_missing(folder, protos, message))
     envelope = locked.messages.get(locked.message) if locked is not None else None
 
-    def rank(each: tuple[str, str]) -> tuple[bool, bool, bool]:
-        file, name = each
+    def rank(declaration: tuple[str, str]) -> tuple[bool, bool, bool]:
+        file, name = declaration
         is_locked = envelope is not None and file == envelope.file
         return is_locked, name == wanted, scan(folder.files[file]).is_top_level(name)
 
-    best = max(map(rank, found))
-    found = [*dict.fromkeys(each for each in found if rank(each) == best)]
-    if len(found) > 1:
-        files = " and ".join(file for file, _ in found)
+    best = max(map(rank, declarations))
+    declarations = [*dict.fromkeys(declaration for declaration in declarations if rank(declaration) == best)]
+    if len(declarations) > 1:
+        files = " and ".join(file for file, _ in declarations)
         what = f"several files declare a message '{wanted}': {files}"
         hint = "remove all but one, or write the full name if they have packages"
         raise TableError.of(message.span, Code.DUPLICATE_MESSAGE, what, hint)
-    file, name = found[0]
+    file, name = declarations[0]
     if (above := _folder_above(folder, file)) is not None:
         raise TableError([_too_deep(folder, protos, above, file)])
     return file, name
@@ -284,7 +286,7 @@ def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> lis
     message = f"no .proto file declares a message '{wanted.value}'"
     if folder.excluded:
         hint = f"is it in a file that `exclude` leaves out ({', '.join(folder.excluded)})?"
-    faults = [each for found in folder.faults.values() for each in found]
+    faults = [fault for faults in folder.faults.values() for fault in faults]
     return [Diagnostic(wanted.span, Code.BAD_VALUE, message, hint), *faults]
 
 
@@ -298,7 +300,7 @@ def _folder_above(folder: Folder, file: str) -> Path | None:
     if not imports or any(name in folder.files or name in folder.faults for name in imports):
         return None
     above = folder.root.parents[:_FURTHER_UP]
-    return next((each for each in above if all(inputs.is_file(each / name) for name in imports)), None)
+    return next((parent for parent in above if all(inputs.is_file(parent / name) for name in imports)), None)
 
 
 def _too_deep(folder: Folder, protos: Located[Path], right: Path, file: str) -> Diagnostic:

@@ -117,7 +117,7 @@ class ProtoSources:
         for file in files:
             self._encoded[file.name] = file.SerializeToString()
             names = [name for name, _, _ in holders(file)]
-            extensions = [inside(file.package, each.name) for each in file.extension]
+            extensions = [inside(file.package, extension.name) for extension in file.extension]
             self._holders |= dict.fromkeys([*names, *extensions], file.name)
 
     def file(self, name: str) -> str:
@@ -141,17 +141,17 @@ class _File:
 
     def __init__(self, file: FileDescriptorProto, path: Path) -> None:
         self._text = ProtoText(path)
-        self._locations = {tuple(each.path): tuple(each.span) for each in file.source_code_info.location}
+        self._locations = {tuple(location.path): tuple(location.span) for location in file.source_code_info.location}
         self._places: dict[str, _Place] = {}
         for name, place, declared in holders(file):
             self._places[name] = _Place(place, _TYPE_PARTS)
             if isinstance(declared, DescriptorProto):
-                self._add(name, [each.name for each in declared.field], (*place, _MESSAGE_FIELD), _FIELD_PARTS)
-                extensions = [each.name for each in declared.extension]
+                self._add(name, [field.name for field in declared.field], (*place, _MESSAGE_FIELD), _FIELD_PARTS)
+                extensions = [extension.name for extension in declared.extension]
                 self._add(name, extensions, (*place, _MESSAGE_EXTENSION), _FIELD_PARTS)
             else:
-                self._add(name, [each.name for each in declared.value], (*place, _ENUM_VALUE), _VALUE_PARTS)
-        self._add(file.package, [each.name for each in file.extension], (_FILE_EXTENSION,), _FIELD_PARTS)
+                self._add(name, [value.name for value in declared.value], (*place, _ENUM_VALUE), _VALUE_PARTS)
+        self._add(file.package, [extension.name for extension in file.extension], (_FILE_EXTENSION,), _FIELD_PARTS)
 
     def _add(self, holder: str, names: Iterable[str], path: _Path, parts: Mapping[Part, tuple[int, ...]]) -> None:
         for index, name in enumerate(names):
@@ -170,19 +170,19 @@ class _File:
 
 def field_comments(files: Iterable[FileDescriptorProto]) -> dict[str, str]:
     """Return the comments above and beside fields, each as one line, by full name; only for fields with comments."""
-    found: dict[str, str] = {}
+    by_field: dict[str, str] = {}
     for file in files:
         comments = {
-            tuple(each.path): " ".join(f"{each.leading_comments} {each.trailing_comments}".split())
-            for each in file.source_code_info.location
-            if each.leading_comments or each.trailing_comments
+            tuple(location.path): " ".join(f"{location.leading_comments} {location.trailing_comments}".split())
+            for location in file.source_code_info.location
+            if location.leading_comments or location.trailing_comments
         }
         for name, path, declared in holders(file):
             if isinstance(declared, DescriptorProto):
                 for index, member in enumerate(declared.field):
                     if comment := comments.get((*path, _MESSAGE_FIELD, index)):
-                        found[f"{name}.{member.name}"] = comment
-    return found
+                        by_field[f"{name}.{member.name}"] = comment
+    return by_field
 
 
 def inside(holder: str, name: str) -> str:

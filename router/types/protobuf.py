@@ -107,12 +107,12 @@ class ProtoSchema:
 
     def unbounded(self, message: str) -> str:
         """Describe the first field of a message, by full name, without a largest encoding, and count others; or ""."""
-        found = [*unbounded_fields(self.descriptor(message), self.board_options)]
-        if not found:
+        fields = [*unbounded_fields(self.descriptor(message), self.board_options)]
+        if not fields:
             return ""
-        path = ".".join(step.name for step in found[0].path)
-        more = f" (and {plural(len(found) - 1, 'more field')})" if len(found) > 1 else ""
-        return f"{path} {found[0].why}{more}"
+        path = ".".join(step.name for step in fields[0].path)
+        more = f" (and {plural(len(fields) - 1, 'more field')})" if len(fields) > 1 else ""
+        return f"{path} {fields[0].why}{more}"
 
     def span(self, message: str, field: str | None = None) -> SourceSpan:
         """Return the span of a message or enum, or of a field or enum value, in its `.proto` file."""
@@ -190,7 +190,7 @@ def load_protos(
     """
     with inputs.noted() as read:
         schema = _load(protos, message, lock, exclude, with_others=with_others)
-    schema.exclude = [each.value for each in exclude]
+    schema.exclude = [entry.value for entry in exclude]
     schema.inputs = read
     return schema
 
@@ -214,11 +214,11 @@ def _load(
     if needed := [_excluded_finding(name, message, folder) for name in sorted(used & folder.excluded.keys())]:
         raise TableError(needed)
     compiled = compile_protos(folder, [file])
-    names = [each.name for each in compiled.file]
+    names = [file.name for file in compiled.file]
     warnings, valid = _check_others(folder, names)
     if with_others and valid:
         compiled = compile_protos(folder, [*names, *valid])
-    files = {each.name: each for each in compiled.file}
+    files = {file.name: file for file in compiled.file}
     _note_hidden(folder, files)
     findings = _reserved_number_findings(folder, compiled)
     options = {}
@@ -263,7 +263,7 @@ def _readable_lock(path: Path) -> Lock | None:
 
 
 def _faults(folder: Folder, proto: str) -> list[Diagnostic]:
-    return [each for name, faults in folder.faults.items() if proto_of(name) == proto for each in faults]
+    return [fault for name, faults in folder.faults.items() if proto_of(name) == proto for fault in faults]
 
 
 def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnostic], list[str]]:
@@ -313,22 +313,24 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
 def _reserved_number_findings(folder: Folder, compiled: FileDescriptorSet) -> list[Diagnostic]:
     """Return findings for field numbers that protoc refuses, but only in the files that its command line names."""
     own = [file for file in compiled.file if inputs.is_file(folder.root / file.name)]
-    found = [name for file in own for name in _with_reserved_number(file)]
-    if not found:
+    names = [name for file in own for name in _with_reserved_number(file)]
+    if not names:
         return []
     sources = _sources(folder, compiled)
     message = "Field numbers 19000 through 19999 are reserved for the protocol buffer library implementation"
     hint = "use another number"
-    return [Diagnostic(sources.span(name, Part.NUMBER), Code.BAD_PROTO, message, hint) for name in found]
+    return [Diagnostic(sources.span(name, Part.NUMBER), Code.BAD_PROTO, message, hint) for name in names]
 
 
 def _with_reserved_number(file: FileDescriptorProto) -> list[str]:
     """Return the full names of fields and extensions with such a number."""
-    declared = [inside(file.package, each.name) for each in file.extension if each.number in _RESERVED_NUMBERS]
+    declared = [
+        inside(file.package, extension.name) for extension in file.extension if extension.number in _RESERVED_NUMBERS
+    ]
     for holder, _, message in holders(file):
         if isinstance(message, DescriptorProto):
             members = (*message.field, *message.extension)
-            declared += [inside(holder, each.name) for each in members if each.number in _RESERVED_NUMBERS]
+            declared += [inside(holder, member.name) for member in members if member.number in _RESERVED_NUMBERS]
     return declared
 
 
@@ -360,7 +362,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     ]
     sizes = (member_size(field, schema.board_options) for field in others)
     bounded += [size for size in sizes if size is not None]
-    has_room_for_all = any(each.is_apart for each in options.values())
+    has_room_for_all = any(option.is_apart for option in options.values())
     max_size = sum(bounded) if has_room_for_all else max(bounded, default=0)
     max_size += largest_beside(oneof, schema.board_options)
     unroutable = {
@@ -371,7 +373,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
 
 def _oneof_hint(schema: ProtoSchema, name: str) -> str:
     own = _oneofs(schema.descriptor(schema.envelope))
-    others = [each for each in schema.messages if name in _oneofs(schema.descriptor(each))]
+    others = [message for message in schema.messages if name in _oneofs(schema.descriptor(message))]
     if nearest(name, own) or not others:
         alone = f"declare it: its members are the payload cases of {schema.envelope}"
         return did_you_mean(name, own) or alone
@@ -381,7 +383,7 @@ def _oneof_hint(schema: ProtoSchema, name: str) -> str:
 
 def _oneofs(message: Descriptor) -> list[str]:
     """Return the names of the oneofs of a message, without those that stand for `optional`."""
-    return [name for name, each in message.oneofs_by_name.items() if name != f"_{each.fields[0].name}"]
+    return [name for name, oneof in message.oneofs_by_name.items() if name != f"_{oneof.fields[0].name}"]
 
 
 def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:

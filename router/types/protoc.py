@@ -86,7 +86,7 @@ _MOST_LINES = 3
 
 def _without_consequences(complaints: Sequence[Complaint], names: Container[str]) -> Iterator[Complaint]:
     lacking = {complaint.file for complaint in complaints if _IMPORT_FAILED.fullmatch(complaint.message)}
-    twice = {found["name"] for complaint in complaints if (found := _TYPE_TAKEN.match(complaint.message))}
+    twice = {taken["name"] for complaint in complaints if (taken := _TYPE_TAKEN.match(complaint.message))}
     for complaint in complaints:
         if complaint.file == EVERYTHING:
             continue
@@ -161,14 +161,14 @@ def _import_hint(name: str, importer: str, files: Collection[str], root: Path) -
 
 def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     """Return a hint with the files that declare a type that is not defined where it is used."""
-    found = declaring(name, files)
-    if not found:
+    declarations = declaring(name, files)
+    if not declarations:
         names = [known for content in files.values() for known in scan(content).names]
         close = nearest(name, [*names, *_SCALARS])
         return f"did you mean '{close}'?" if close else ""
     imported = scan(files.get(user, b"")).imports
     parts = []
-    for file, full in found:
+    for file, full in declarations:
         declared = f"{file} declares it" if full == name else f"{file} declares {full}"
         parts.append(declared if file in imported else f'add `import "{file}";`: {declared}')
     return "; ".join(parts)

@@ -63,7 +63,7 @@ class MsgFiles:
     def names(self) -> Iterator[str]:
         for folder in self._folders:
             packages = inputs.listing(folder)[0]
-            for package in (each for each in packages if not inputs.exists(folder / each / IGNORED)):
+            for package in (name for name in packages if not inputs.exists(folder / name / IGNORED)):
                 for file in inputs.listing(folder / package / "msg")[1]:
                     name, _, ending = file.rpartition(".")
                     if ending == "msg":

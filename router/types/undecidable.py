@@ -22,11 +22,11 @@ _Found = tuple[str, str, str]
 def undecidable(envelope: Descriptor, members: Container[int], place: Place) -> list[Diagnostic]:
     """Return findings about an envelope and all types in it. `members` are the numbers of the oneof's members."""
     types = all_types(envelope)
-    found = [*_of_envelope(envelope, members), *(each for descriptor in types for each in _of_type(descriptor))]
+    faults = [*_of_envelope(envelope, members), *(fault for descriptor in types for fault in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
         what = f"{envelope.full_name} contains {len(types)} message types; the limit is {MOST_TYPES}"
-        found.append((envelope.full_name, what, ""))
-    return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in found]
+        faults.append((envelope.full_name, what, ""))
+    return [Diagnostic(place(name), Code.BAD_PROTO, what, hint) for name, what, hint in faults]
 
 
 def _of_envelope(envelope: Descriptor, members: Container[int]) -> Iterator[_Found]:
