@@ -47,7 +47,7 @@ def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
 
     The last value wins, as in ROS. Node names of parameters are ignored. Raises StartError.
     """
-    return {each.name: each.value for each in _parameters(ros_args)}
+    return {parameter.name: parameter.value for parameter in _parameters(ros_args)}
 
 
 def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
@@ -76,8 +76,7 @@ def without_effect(ros_args: Sequence[str], program: Program, names_read: Collec
     node = _remapped(program.table.node, rules)
     has_node = bool(program.publishers or program.subscriptions or program.gateways)
     variables = sorted(name.lower() for name in names_read)
-    for each in dict.fromkeys((each.node, each.name) for each in _parameters(ros_args)):
-        owner, name = each
+    for owner, name in dict.fromkeys((parameter.node, parameter.name) for parameter in _parameters(ros_args)):
         read = {*variables, ROUTES_PATH, *(_PARAMETERS_OF_ROS if has_node else ())}
         if name not in read and _is_for(owner, node):
             yield f"-p {name}", _for_parameter(name, read, variables)
@@ -111,7 +110,7 @@ def _for_rule(match: str, topics: Mapping[str, str], node: NodeSettings) -> str:
 def _topics(program: Program, node: NodeSettings) -> dict[str, str]:
     """Return the topics as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
-    inbound = [each.topic.topic.value for gateway in program.gateways for each in gateway.settings.inbound]
+    inbound = [entry.topic.topic.value for gateway in program.gateways for entry in gateway.settings.inbound]
     return {resolved(topic, node): topic for topic in (*plans, *inbound)}
 
 

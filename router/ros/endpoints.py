@@ -224,10 +224,10 @@ def open_missing(
                 opened.append(open_one(plan, classes[plan.type_name], spans[plan.label]))
                 opening.callback(opened[-1].close)
         opening.pop_all()
-    beside = {each.plan.label: each for each in opened}
+    beside = {endpoint.plan.label: endpoint for endpoint in opened}
     return {plan.label: beside.get(plan.label) or now[plan.label] for plan in plans}, opened
 
 
 def unused(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
     """Return the open endpoints that are not in `kept`."""
-    return [each for topic, each in now.items() if kept.get(topic) is not each]
+    return [endpoint for topic, endpoint in now.items() if kept.get(topic) is not endpoint]

@@ -122,4 +122,4 @@ def _middlewares(environ: Mapping[str, str]) -> set[str]:
     """Return the middlewares registered by the sourced workspaces and this Python."""
     prefixes = [*filter(None, environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     folders = [Path(prefix, "share", "ament_index", "resource_index", "rmw_typesupport") for prefix in prefixes]
-    return {each.name for folder in folders for each in folder.glob("*")} - {"rmw_implementation"}
+    return {file.name for folder in folders for file in folder.glob("*")} - {"rmw_implementation"}

@@ -85,19 +85,19 @@ def look(node: Node, ours: Ours) -> Surroundings:
             if set(types.get(topic, ())) <= {plan.type_name}:
                 continue
             with node.handle:
-                found = ask(node.handle, topic, False)
-            for each in found:
-                if each["topic_type"] != plan.type_name:
-                    name = _absolute(each["node_name"], each["node_namespace"])
-                    mistyped[Mistyped(plan.label, peer, each["topic_type"], plan.type_name)].append(name)
-    marked = [each for each in marks(types) if each[1] != this_router()]
+                endpoints = ask(node.handle, topic, False)
+            for endpoint in endpoints:
+                if endpoint["topic_type"] != plan.type_name:
+                    name = _absolute(endpoint["node_name"], endpoint["node_namespace"])
+                    mistyped[Mistyped(plan.label, peer, endpoint["topic_type"], plan.type_name)].append(name)
+    marked = [(name, router) for name, router in marks(types) if router != this_router()]
     shared = frozenset(
         Shared(router, name if name == ours.node else ours.received[name].label, name == ours.node)
         for name, router in marked
         if (name == ours.node or name in ours.received) and not router.has_ended
     )
     with node.handle:
-        nodes = [_absolute(*each) for each in node.handle.get_node_names_and_namespaces()]
+        nodes = [_absolute(*names) for names in node.handle.get_node_names_and_namespaces()]
     known = sum(name == ours.node for name, _ in marked) + (node.get_fully_qualified_name() == ours.node)
     return Surroundings(dict(mistyped), shared, max(0, nodes.count(ours.node) - known))
 
@@ -125,19 +125,19 @@ class GraphWatch:
         # A node and its topics are discovered one after the other.
         namesakes, self._namesakes = min(latest.namesakes, self._namesakes), latest.namesakes
         before, self.now = self.now, replace(latest, namesakes=namesakes)
-        for each in self.now.mistyped.keys() - before.mistyped.keys():
-            nodes = {name for name in self.now.mistyped[each] if not name.endswith(_UNKNOWN)}
-            logger.warning(str(each), topic=each.topic, nodes=sorted(nodes))
+        for mistyped in self.now.mistyped.keys() - before.mistyped.keys():
+            nodes = {name for name in self.now.mistyped[mistyped] if not name.endswith(_UNKNOWN)}
+            logger.warning(str(mistyped), topic=mistyped.topic, nodes=sorted(nodes))
         _log_routers(self.now.shared - before.shared)
         if self.now.namesakes > before.namesakes:
             logger.warning("another node has the name of this router", node=ours.node)
 
 
 def _log_routers(new: Iterable[Shared]) -> None:
-    found: dict[Router, list[str]] = defaultdict(list)
-    for each in sorted(new):
-        found[each.router].append(each.name)
-    for router, names in found.items():
+    by_router: dict[Router, list[str]] = defaultdict(list)
+    for shared in sorted(new):
+        by_router[shared.router].append(shared.name)
+    for router, names in by_router.items():
         what = "another router has the name of this one or takes messages from the same topics"
         logger.warning(what, host=router.host, process=router.process, shared=names)
 

@@ -79,5 +79,5 @@ class Mark:
 def marks(topics: Iterable[str]) -> Iterator[tuple[str, Router]]:
     """Yield the marked names among discovered topics, each with the router that has marked it."""
     for topic in topics:
-        if found := _MARK.fullmatch(topic):
-            yield found["name"], Router(found["host"], int(found["process"]), found["place"])
+        if mark := _MARK.fullmatch(topic):
+            yield mark["name"], Router(mark["host"], int(mark["process"]), mark["place"])

@@ -105,7 +105,7 @@ def class_for_cdr(package: str, kind: str, short: str, definitions: Mapping[str,
 
         library = import_type_support(package)
         members = {
-            f"_{each.upper()}": getattr(library, f"{each}_msg__{kind}__{_snake_case(short)}") for each in _MEMBERS
+            f"_{member.upper()}": getattr(library, f"{member}_msg__{kind}__{_snake_case(short)}") for member in _MEMBERS
         }
     except Exception:  # noqa: BLE001 the import of the class will report the error in more detail
         return None
@@ -149,9 +149,9 @@ def _described(capsule: object) -> Iterator[tuple[str, Definition]]:
     if not describe:
         return
     description = describe(address).contents
-    for found in (description.type, *description.referenced.data[: description.referenced.size]):
-        fields = [(str(field.name), _spelled(field.type)) for field in found.fields.data[: found.fields.size]]
-        yield str(found.name), tuple(field for field in fields if field[0] != _OF_EMPTY)
+    for described in (description.type, *description.referenced.data[: description.referenced.size]):
+        fields = [(str(field.name), _spelled(field.type)) for field in described.fields.data[: described.fields.size]]
+        yield str(described.name), tuple(field for field in fields if field[0] != _OF_EMPTY)
 
 
 def _spelled(declared: _FieldType) -> str:

@@ -66,26 +66,26 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
     Raises StartError unless the type and its nested types are installed as in `definitions`.
     """
     package, kind, short = _parts(name)
-    found = None
+    message_class = None
     if _has_part(package, kind):
         with lean_interfaces():
-            found = class_for_cdr(package, kind, short, definitions)
-        if found is not None and _other_library(package, found) is None:
-            return found
+            message_class = class_for_cdr(package, kind, short, definitions)
+        if message_class is not None and _other_library(package, message_class) is None:
+            return message_class
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
             raise _mismatch(part, installed, compiled)
-    if found is not None:
-        return found
-    found = loaded_class(name)
-    if (library := _other_library(package, found)) is not None:
+    if message_class is not None:
+        return message_class
+    message_class = loaded_class(name)
+    if (library := _other_library(package, message_class)) is not None:
         is_ignored = (asset("schemas") / package / IGNORED).exists()
         raise ConfigurationError(
             f"the package '{package}' is installed twice: {_folder(package)} is used with {library}",
             "run 'make setup', which removes the ignored one" if is_ignored else "source only one of them",
         )
-    return found
+    return message_class
 
 
 def _other_library(package: str, message_class: Any) -> Path | None:
@@ -152,18 +152,18 @@ def installed_class(name: str) -> Any:
         )
     try:
         with lean_interfaces():
-            found = _member(importlib.import_module(f"{package}.{kind}"), short)
+            message_class = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
         raise _kind(error)(f"{name} cannot be loaded: {error}") from error
-    if not hasattr(found, "get_fields_and_field_types"):
+    if not hasattr(message_class, "get_fields_and_field_types"):
         raise ConfigurationError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
-    return found
+    return message_class
 
 
 def _kind(error: Exception) -> type[StartError]:
     """Return the class of error for a type that cannot be loaded because of `error`."""
     causes = error, error.__context__  # rclpy's own error hides that of a library
-    return StartError if any(each is not None and is_shortage(each) for each in causes) else ConfigurationError
+    return StartError if any(cause is not None and is_shortage(cause) for cause in causes) else ConfigurationError
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -176,8 +176,8 @@ def _parts(name: str) -> tuple[str, ...]:
 
 def _has_part(package: str, kind: str) -> bool:
     """Return whether the package is installed, without importing it."""
-    found = PathFinder.find_spec(package)
-    return bool(found and PathFinder.find_spec(f"{package}.{kind}", found.submodule_search_locations or []))
+    spec = PathFinder.find_spec(package)
+    return bool(spec and PathFinder.find_spec(f"{package}.{kind}", spec.submodule_search_locations or []))
 
 
 def _member(module: ModuleType, name: str) -> Any:
@@ -202,8 +202,8 @@ def installed_type(name: str) -> MessageType:
 
 def _message(name: str, known: dict[str, MessageType]) -> MessageType:
     if name not in known:
-        found = installed_class(name)
-        slots = zip(found.get_fields_and_field_types(), found.SLOT_TYPES, strict=True)
+        message_class = installed_class(name)
+        slots = zip(message_class.get_fields_and_field_types(), message_class.SLOT_TYPES, strict=True)
         known[name] = MessageType(
             name, tuple(Field(field, _type(slot, f"{name}.{field}", known)) for field, slot in slots)
         )
