@@ -108,8 +108,8 @@ class ClientQueue:
     def leave(self) -> None:
         """Free all frames: the client has left."""
         self.has_left = True
-        for each in (self._schemas, self._values, self._held, self.shown):
-            each.clear()
+        for frames in (self._schemas, self._values, self._held, self.shown):
+            frames.clear()
         self._wake()
 
     def _wake(self) -> None:
@@ -214,23 +214,23 @@ class Clients:
             return
         ready: list[ClientQueue] = []
         behind: list[ClientQueue] = []
-        for each in self.queues.values():
-            if each.holds:
-                self.send_to(each, each.hold_back(frames))
+        for queue in self.queues.values():
+            if queue.holds:
+                self.send_to(queue, queue.hold_back(frames))
             else:
-                (ready if each.keeps_up else behind).append(each)
+                (ready if queue.keeps_up else behind).append(queue)
         if behind:
             self._queue(behind, frames)
         if len(ready) > 1:
-            self._transport.write_all([each.client for each in ready], self._on_wire(frames, len(ready)))
-            for each in ready:
-                each.sent += len(frames)
+            self._transport.write_all([queue.client for queue in ready], self._on_wire(frames, len(ready)))
+            for queue in ready:
+                queue.sent += len(frames)
         elif ready:
             ready[0].write(frames)
 
     def has_room(self, size: int) -> bool:
         """Return whether the backlogs of all clients leave room for a kept message of this size."""
-        backlog = sum(each.backlog() for each in self.queues)
+        backlog = sum(queue.backlog() for queue in self.queues)
         return backlog == 0 or backlog + size <= MOST_BACKLOG
 
     def record_miss(self, topic: str) -> None:
@@ -248,7 +248,7 @@ class Clients:
             self._queue([queue], frames)
 
     def joined(self, client: Client) -> ClientQueue:
-        taken = {each.number for each in self.queues.values()}
+        taken = {queue.number for queue in self.queues.values()}
         number = next(number for number in count() if number not in taken)
         queue = self.queues[client] = ClientQueue(client, number, self._on_wire)
         self._counters.clients(len(self.queues))
@@ -267,15 +267,17 @@ class Clients:
             queue.drained()
 
     def _queue(self, queues: Sequence[ClientQueue], frames: Sequence[Frame]) -> None:
-        schemas: dict[Hashable, Frame] = {(each.topic, each.type_name): each for each in frames if each.is_schema}
+        schemas: dict[Hashable, Frame] = {(frame.topic, frame.type_name): frame for frame in frames if frame.is_schema}
         values: dict[str, Frame] = {}
-        for frame in (each for each in frames if not each.is_schema):
+        for frame in frames:
+            if frame.is_schema:
+                continue
             if frame.topic in values:
                 for queue in queues:
                     queue.missed_topics.add(frame.topic)
             values[frame.topic] = frame
         now = self._clock_ns()
-        self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))
+        self._counters.superseded(sum(queue.put(schemas, values, len(frames), now) for queue in queues))
 
     def _log_change(self, event: str, queue: ClientQueue) -> None:
         """Log that a client joined or left; the log summarizes repetitions from one host."""

@@ -97,9 +97,9 @@ _read = reader(msgspec.json.Decoder(Union[_Publish, _Schema]))
 def request(text: bytes) -> Request:
     """Parse a client's document, but not the data of a message. Raises PacketError if it is not a request."""
     try:
-        found = _read(text)
+        document = _read(text)
     except msgspec.ValidationError as error:
         raise PacketError(f"not a request: {shown(str(error))}") from None
-    if isinstance(found, _Schema):
-        return SchemaRequest(found.type)
-    return PublishRequest(found.topic, found.type, found.time, bytes(found.data))
+    if isinstance(document, _Schema):
+        return SchemaRequest(document.type)
+    return PublishRequest(document.topic, document.type, document.time, bytes(document.data))

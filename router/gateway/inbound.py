@@ -77,7 +77,8 @@ class InboundPublisher:
         self._encoding = encoding
         self._most = plan.settings.max_inbound
         self._topics = {
-            topic: _Topic(outputs.library, each, encoding.style, counters, name) for topic, each in plan.inbound.items()
+            topic: _Topic(outputs.library, topic_plan, encoding.style, counters, name)
+            for topic, topic_plan in plan.inbound.items()
         }
         self._counts = counts
         self._outputs = outputs

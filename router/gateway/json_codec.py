@@ -342,12 +342,12 @@ class _Writing:
 
     def struct(self, message: MessageType) -> type:
         """Return the Struct of a message. Its attributes are `f0`, `f1` ..., as names may be Python keywords."""
-        if (made := self._structs.get(message)) is None:
+        if (struct := self._structs.get(message)) is None:
             fields = message.fields or (PLACEHOLDER,)
             members: list[Any] = [(f"f{index}", self._field(field.type)) for index, field in enumerate(fields)]
             if not message.fields:
                 members = [(*members[0], (0,) if self._is_wrapped else 0)]
-            made = self._structs[message] = msgspec.defstruct(
+            struct = self._structs[message] = msgspec.defstruct(
                 message.short_name,
                 members,
                 rename={f"f{index}": field.name for index, field in enumerate(fields)},
@@ -355,7 +355,7 @@ class _Writing:
                 frozen=True,
                 gc=False,
             )
-        return made
+        return struct
 
     def _field(self, declared: Type) -> Any:
         bare = self._bare(declared)
@@ -401,8 +401,8 @@ class _Writing:
                 if declared.length is None:
                     put_length(data, len(value))
                 if isinstance(element, (MessageType, String)):
-                    for each in value:
-                        self.write(data, element, each, f"{path}[]")
+                    for item in value:
+                        self.write(data, element, item, f"{path}[]")
                 else:
                     _put_scalars(data, element, value, f"{path}[]")
             case String(wide=True):

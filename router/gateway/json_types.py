@@ -45,18 +45,18 @@ def _value_names(message: MessageType) -> dict[str, dict[str, str]]:
     a single integer field has them all. A value with two names has none.
     """
     integers = [field.name for field in message.fields if isinstance(field.type, Int)]
-    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    by_field: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     constants = {name: value for name, value in message.constants.items() if type(value) is int}
     for name, value in constants.items():
-        owner = max((each for each in integers if name.startswith(f"{each.upper()}_")), key=len, default="")
+        owner = max((field for field in integers if name.startswith(f"{field.upper()}_")), key=len, default="")
         if owner:
-            found[owner][str(value)].append(name[len(owner) + 1 :])
-    if not found and len(integers) == 1:
+            by_field[owner][str(value)].append(name[len(owner) + 1 :])
+    if not by_field and len(integers) == 1:
         for name, value in constants.items():
-            found[integers[0]][str(value)].append(name)
+            by_field[integers[0]][str(value)].append(name)
     return {
         field: {value: name for value, (name, *others) in values.items() if not others}
-        for field, values in found.items()
+        for field, values in by_field.items()
     }
 
 

@@ -46,7 +46,7 @@ def select(
         return None
     types = list(by_frequency(publisher.type_name for publisher in counted))
     type_name = table_type if table_type in types else types[0]
-    others = [each for each in types if each != type_name]
+    others = [other for other in types if other != type_name]
     selected = [publisher for publisher in counted if publisher.type_name == type_name]
     is_reliable = all(publisher.is_reliable for publisher in selected)
     keeps = is_reliable and all(publisher.keeps for publisher in selected)
@@ -56,8 +56,11 @@ def select(
 
 def keepers(publishers: Iterable[DiscoveredPublisher], type_name: str) -> frozenset[bytes]:
     """Return the gids of the publishers that keep messages for late joiners."""
-    kept = (each for each in publishers if each.type_name == type_name and each.keeps and each.is_reliable)
-    return frozenset(each.gid for each in kept)
+    return frozenset(
+        publisher.gid
+        for publisher in publishers
+        if publisher.type_name == type_name and publisher.keeps and publisher.is_reliable
+    )
 
 
 def by_frequency(type_names: Iterable[str]) -> dict[str, int]:

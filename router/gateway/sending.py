@@ -257,8 +257,8 @@ class TopicSender:
         topic = served.subscription
         samples = kept.samples
         if served.selection.is_mixed and (latest := topic.latest()):
-            same = [each for each in samples if (each.sent_ns, each.cdr) != (latest.sent_ns, latest.cdr)]
-            samples = [*same, latest]
+            earlier = [sample for sample in samples if (sample.sent_ns, sample.cdr) != (latest.sent_ns, latest.cdr)]
+            samples = [*earlier, latest]
         for number, sample in enumerate(samples, 1):
             if number % PER_TURN == 0:
                 await asyncio.sleep(0)

@@ -250,7 +250,7 @@ class Subscriptions:
         types loaded, so that `join` is fast. Of the others only the names are returned. Yields to other tasks between
         topics.
         """
-        found: dict[str, Selection] = {}
+        selected: dict[str, Selection] = {}
         beyond: set[str] = set()
         ranked: list[tuple[int, str]] = []
         for number, topic in enumerate(self._topics.names(), 1):
@@ -259,7 +259,7 @@ class Subscriptions:
             if number % PER_TURN == 0:
                 await asyncio.sleep(0)
         for number, (_, topic) in enumerate(sorted(ranked), 1):
-            if len(found) >= most:
+            if len(selected) >= most:
                 if self._topics.has_publishers(topic):
                     beyond.add(topic)
                 if number % PER_TURN == 0:
@@ -268,11 +268,11 @@ class Subscriptions:
             await asyncio.sleep(0)
             publishers, table_type = self._topics.publishers(topic), self._topics.types.get(topic)
             if selection := select(publishers, is_inbound=topic in inbound, table_type=table_type):
-                found[topic] = selection
+                selected[topic] = selection
                 if selection.type_name not in self._types:
                     ready = await self._loop.run_in_executor(self._loader, self._load, selection.type_name)
                     self._types[selection.type_name] = ready
-        return found, beyond
+        return selected, beyond
 
     def is_joined(self, topic: str, callback: OnSample | None) -> bool:
         """Return whether the subscription that `join` with this `callback` would use exists."""

@@ -73,7 +73,7 @@ class Topics:
         self._tasks = tasks
         self._clients = clients
         self._inbound = context.subscriptions.resolved(
-            each.settings.topic.topic.value for each in plan.inbound.values()
+            inbound.settings.topic.topic.value for inbound in plan.inbound.values()
         )
         self._selector = TopicSelector(plan.settings, self._inbound)
         self._served: dict[str, ServedTopic] = {}
@@ -118,14 +118,14 @@ class Topics:
     async def _update(self) -> None:
         """Serve new topics, forget those that are gone, and follow changes of types and QoS."""
         most = self._plan.settings.max_topics
-        found, over_limit = await self._subscriptions.discover(self._inbound, self._rank, most)
+        selections, over_limit = await self._subscriptions.discover(self._inbound, self._rank, most)
         if not self._clients:
             # While a topic has subscribers, the router publishes on it: do not subscribe without clients.
-            found = {topic: selection for topic, selection in found.items() if not selection.is_ours}
-        self._not_served = {topic: state for topic, state in self._not_served.items() if topic in found}
-        for topic in self._served.keys() - found.keys():
+            selections = {topic: selection for topic, selection in selections.items() if not selection.is_ours}
+        self._not_served = {topic: state for topic, state in self._not_served.items() if topic in selections}
+        for topic in self._served.keys() - selections.keys():
             self._forget(topic)
-        for topic, selection in found.items():
+        for topic, selection in selections.items():
             served = self._served.get(topic)
             if served is None or served.selection != selection or not served.subscription.is_open:
                 self._try_to_serve(topic, selection)
@@ -221,7 +221,7 @@ class Topics:
             """Serve the topics whose turn is now or was missed."""
             nonlocal done
             now = round((clock() - begin) / turn_s)
-            turns = {each % number for each in range(max(done, now - number) + 1, now + 1)}
+            turns = {slot % number for slot in range(max(done, now - number) + 1, now + 1)}
             done = now
             await serve([served for served in self._served.values() if served.number % number in turns])
 
@@ -229,7 +229,7 @@ class Topics:
 
     async def _publish(self, period: int, due: Sequence[ServedTopic]) -> None:
         frames: list[Frame] = []
-        for number, served in enumerate([each for each in due if each.period == period], 1):
+        for number, served in enumerate([served for served in due if served.period == period], 1):
             try:
                 self._sender.poll(served, frames)
             except Exception as error:  # noqa: BLE001 reported; other topics are still served
@@ -314,20 +314,20 @@ class Topics:
                     return False
                 if frame.sent_ns in begun_with:
                     continue
-                if waiting and sum(len(each.data) for each in (*waiting, frame)) > LOW_WATER:
+                if waiting and sum(len(other.data) for other in (*waiting, frame)) > LOW_WATER:
                     if not await self._write_when_drained(queue, waiting, until):
                         return False
-                    known.update(each.sent_ns for each in waiting)
+                    known.update(other.sent_ns for other in waiting)
                     waiting = []
-                held = [each for each in queue.held_before(topic, frame.sent_ns) if each.sent_ns not in skipped]
-                skipped.update(each.sent_ns for each in held)
+                held = [other for other in queue.held_before(topic, frame.sent_ns) if other.sent_ns not in skipped]
+                skipped.update(other.sent_ns for other in held)
                 waiting += (*held, frame)
         while waiting := waiting or _beginning(
-            each for each in queue.held_before(topic, inf) if each.sent_ns not in known
+            other for other in queue.held_before(topic, inf) if other.sent_ns not in known
         ):
             if not await self._write_when_drained(queue, waiting, until):
                 return False
-            known.update(each.sent_ns for each in waiting)
+            known.update(other.sent_ns for other in waiting)
             waiting = []
         return True
 
@@ -398,11 +398,11 @@ class Topics:
 
 def _beginning(frames: Iterable[Frame]) -> list[Frame]:
     """Return the first frames, at most LOW_WATER bytes but at least one frame."""
-    found: list[Frame] = []
+    first: list[Frame] = []
     size = 0
     for frame in frames:
         size += len(frame.data)
-        if found and size > LOW_WATER:
+        if first and size > LOW_WATER:
             break
-        found.append(frame)
-    return found
+        first.append(frame)
+    return first

@@ -257,7 +257,7 @@ class StreamTransport(ABC):
         """Add a client and return "", or return (and log) why it is rejected."""
         if self.is_closing:
             return "the gateway is shutting down"
-        if key := self.limits.exceeded_by(client.host, [each.host for each in self._clients]):
+        if key := self.limits.exceeded_by(client.host, [other.host for other in self._clients]):
             what = "too many clients" + (" from this host" if "host" in key else "") + "; client rejected"
             self._log.note(key, logger.warning, what, client=client.label, limit=key)
             return what

@@ -102,7 +102,7 @@ class WebsocketTransport(StreamTransport):
 
     def connected(self, connection: Connection) -> None:
         """Called for each TCP connection, before its handshake."""
-        hosts = [each.client.host for each in self._connections]
+        hosts = [connection.client.host for connection in self._connections]
         limits = Limits(self.limits.clients + STRANGERS, self.limits.clients_per_host + STRANGERS_PER_HOST, 0)
         self._connections.add(connection)
         if self.is_closing or not self.admits(connection.client) or limits.exceeded_by(connection.client.host, hosts):

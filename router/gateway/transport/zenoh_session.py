@@ -136,11 +136,11 @@ def owners(session: zenoh.Session, key: str) -> set[Owner] | None:
 
     Takes at most LOOK_SECONDS. Raises ZError.
     """
-    found = set()
+    others = set()
     for reply in session.liveliness().get(all_tokens(key), timeout=LOOK_SECONDS):
         if reply.ok is None:
             return None
         owner = owner_of(reply.ok.key_expr)
         if owner is not None and owner.session != str(session.zid()):
-            found.add(owner)
-    return found
+            others.add(owner)
+    return others
