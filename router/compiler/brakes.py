@@ -39,12 +39,12 @@ def brake_findings(table: RouteTable, routes: Sequence[CheckedRoute]) -> Iterato
 
 def _taken(table: RouteTable, boards: Collection[str]) -> Mapping[str, Sequence[str]]:
     """Return the payload cases that routes send to each board."""
-    found: dict[str, dict[str, None]] = {name: {} for name in table.endpoints if name in boards}
+    by_board: dict[str, dict[str, None]] = {name: {} for name in table.endpoints if name in boards}
     for route in table.routes:
         for destination in route.destinations:
-            if destination.endpoint.value in found:
-                found[destination.endpoint.value][route.case.value] = None
-    return {name: [*cases] for name, cases in found.items()}
+            if destination.endpoint.value in by_board:
+                by_board[destination.endpoint.value][route.case.value] = None
+    return {name: [*cases] for name, cases in by_board.items()}
 
 
 def _unheard(
@@ -60,7 +60,7 @@ def _unheard(
     if deadman.because is not None or not table.endpoints.keys() >= {*names}:
         return  # it is intended, or there is a finding already
     boards = [name for name in names if name in taken]
-    if not boards and taken.keys().isdisjoint(each.endpoint.value for each in route.destinations):
+    if not boards and taken.keys().isdisjoint(destination.endpoint.value for destination in route.destinations):
         takers = [name for name, of_board in taken.items() if any(case.value in of_board for case in cases)]
         message = f"the deadman stops nothing: it sends to '{names[0]}', which is not a board"
         yield _doubtful(deadman.to[0].span, message, f"set `to: {_flow(takers)}`" if takers else "name boards in `to`")
@@ -92,7 +92,7 @@ def _any_age(checked: CheckedRoute) -> Iterator[Diagnostic]:
     Commands that wait in the router have another finding.
     """
     route = checked.route
-    targets = [*checked.targets, *(each for topic in checked.subscriptions for each in topic.targets)]
+    targets = [*checked.targets, *(target for topic in checked.subscriptions for target in topic.targets)]
     others = [name for target in targets for name in target.deadmen if name != route.name]
     if route.deadman is not None:
         if route.destinations and not any(target.is_deferred for target in targets):
@@ -117,8 +117,8 @@ def _latched(checked: CheckedRoute) -> Iterator[Diagnostic]:
 
 def _durability(topic: Topic) -> SourceSpan:
     """Return the place that makes a topic's messages outlive their publication."""
-    found = (topic.qos.durability or topic.qos.profile) if topic.qos else None
-    return found.span if found else topic.span
+    setting = (topic.qos.durability or topic.qos.profile) if topic.qos else None
+    return setting.span if setting else topic.span
 
 
 def _any_age_of_clients(table: RouteTable, boards: Collection[str]) -> Iterator[Diagnostic]:
@@ -139,12 +139,12 @@ def _any_age_of_clients(table: RouteTable, boards: Collection[str]) -> Iterator[
 
 def _sent_to(table: RouteTable, boards: Collection[str]) -> Mapping[str, str]:
     """Return a board for each topic, by absolute name, whose messages a route sends to boards."""
-    found: dict[str, str] = {}
+    by_topic: dict[str, str] = {}
     for route in table.routes:
-        for board in (each.endpoint.value for each in route.destinations if each.endpoint.value in boards):
+        for board in (to.endpoint.value for to in route.destinations if to.endpoint.value in boards):
             for topic in route.source_topics:
-                found.setdefault(resolved(topic.topic.value, table.node), board)
-    return found
+                by_topic.setdefault(resolved(topic.topic.value, table.node), board)
+    return by_topic
 
 
 _CLIENTS = " to the topic, which counts from the `time` of the client"

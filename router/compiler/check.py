@@ -134,7 +134,7 @@ def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: i
     """Return the limits of each board by name; `limit` is the largest envelope in bytes."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
-    return {each.name: BoardLimits(fields, limit, each.allow_non_finite) for each in boards}
+    return {board.name: BoardLimits(fields, limit, board.allow_non_finite) for board in boards}
 
 
 def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:

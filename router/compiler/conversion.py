@@ -60,8 +60,8 @@ def convert(value: tree.Node, target: Type, scope: Scope) -> Plan:
 
 def same_named(holder: tree.Node, member: Field) -> tree.Node | None:
     """Return the field of `holder` with the name of `member`, or None."""
-    found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
-    return field_of(holder, found, holder.span) if found else None
+    field = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
+    return field_of(holder, field, holder.span) if field else None
 
 
 def unset(member: Field, span: SourceSpan) -> Unset:
@@ -99,7 +99,7 @@ def _to_time(value: tree.Node, target: MessageType) -> Record:
     """Fill seconds and nanoseconds from nanoseconds. Seconds that do not fit are rejected at run time."""
     parts = _signed_parts(value) if target.name == PROTOBUF_DURATION else _parts(value)
     members = zip(target.fields, parts, strict=True)
-    return Record(target, tuple((member, _part(member.type, made)) for member, made in members), value.span)
+    return Record(target, tuple((member, _part(member.type, part)) for member, part in members), value.span)
 
 
 def _parts(value: tree.Node) -> tuple[tree.Binary, tree.Binary]:
@@ -125,11 +125,11 @@ def _with_number(kind: IntKind, left: tree.Node, operator: tree.Operator, right:
     return tree.Binary(kind, left.span, operator, left, tree.whole(right, left.span))
 
 
-def _part(declared: Type, made: tree.Binary) -> Leaf:
+def _part(declared: Type, value: tree.Binary) -> Leaf:
     assert isinstance(declared, Int)  # noqa: S101 - times are made of integers
-    assert isinstance(made.kind, IntKind)  # noqa: S101
+    assert isinstance(value.kind, IntKind)  # noqa: S101
     limits = _range(declared)
-    return Leaf(declared, made if limits.holds(made.kind) else fitted(made, limits), made.span)
+    return Leaf(declared, value if limits.holds(value.kind) else fitted(value, limits), value.span)
 
 
 def _to_same_named(value: tree.Node, source: MessageType, target: MessageType, scope: Scope) -> Record:
@@ -150,8 +150,8 @@ def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
     try:
         return convert(given, member.type, scope)
     except ExpressionError as error:
-        found = error.diagnostic
-        raise ExpressionError(found.span, found.code, f"{member.name}: {found.message}", found.hint) from error
+        finding = error.diagnostic
+        raise ExpressionError(finding.span, finding.code, f"{member.name}: {finding.message}", finding.hint) from error
 
 
 # lists
@@ -187,15 +187,15 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
     try:
         return convert(element, target, scope)
     except ExpressionError as error:
-        found = error.diagnostic
+        finding = error.diagnostic
         if not isinstance(element.kind, MessageKind):
-            hint = _LIKE_MESSAGES if isinstance(target, MessageType) else found.hint
+            hint = _LIKE_MESSAGES if isinstance(target, MessageType) else finding.hint
         elif isinstance(target, MessageType):
             both = f"{element.kind} and {target}"
             hint = f"give {both} fields of the same name and type: elements are filled by name"
         else:
             hint = "name a field of the elements, as in x.y"
-        raise ExpressionError(found.span, found.code, f"list element: {found.message}", hint) from error
+        raise ExpressionError(finding.span, finding.code, f"list element: {finding.message}", hint) from error
 
 
 def _require_length(value: tree.Node, target: List, length: int) -> None:
@@ -401,19 +401,19 @@ def _number_of(value: tree.Node, name: str, target: Enum) -> int:
 
 
 def _to_bytes(value: tree.Node, target: Bytes) -> tree.Node:
-    made = value
+    octets = value
     match value.kind:
         case BytesKind():
             pass
         case ListKind(element, length) if element is None or _is_octet(element):
             if target.bound is not None and length is not None and length > target.bound:
                 raise ExpressionError(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
-            made = tree.Call(BytesKind(), value.span, "octets", (value,))
+            octets = tree.Call(BytesKind(), value.span, "octets", (value,))
         case ListKind():
             raise mismatch(value, target, f"bytes are integers {OCTET.low}..{OCTET.high}")
         case _:
             raise mismatch(value, target)
-    return made if target.bound is None else limited("fit_text", made, BytesKind(), target.bound)
+    return octets if target.bound is None else limited("fit_text", octets, BytesKind(), target.bound)
 
 
 def _is_octet(kind: Kind) -> bool:

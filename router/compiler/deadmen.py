@@ -54,17 +54,17 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
         lookup.report(deadman.to[0].span, Code.BAD_VALUE, message, "divide them among several routes")
         return None
     sent = [_datagram(lookup, deadman, payload) for payload in deadman.payloads]
-    datagrams = [each for each in sent if each is not None]
+    datagrams = [datagram for datagram in sent if datagram is not None]
     if len(datagrams) < len(sent):
         return None
-    commanded = {each.endpoint.value for each in route.destinations}
+    commanded = {destination.endpoint.value for destination in route.destinations}
     others = frozenset(to.value for to in deadman.to) - commanded
     following = others if len(others) < len(deadman.to) else frozenset()
     trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
     by_endpoint = [
-        (to.value, tuple(trimmed(each) if to.value in trims else each for each in datagrams)) for to in deadman.to
+        (to.value, tuple(trimmed(data) if to.value in trims else data for data in datagrams)) for to in deadman.to
     ]
-    sources = *(each.value for each in route.sources), *(each.topic.value for each in route.source_topics)
+    sources = *(source.value for source in route.sources), *(topic.topic.value for topic in route.source_topics)
     watched = frozenset((source, route.case.value) for source in sources)
     plan = deadman_plan(route.name, deadman, by_endpoint)
     return replace(plan, following=following, disarmed_by=disarmed_by, watched=watched)

@@ -20,7 +20,7 @@ EXTRAS: Mapping[str, Sequence[str]] = {
 def missing_extras(table: RouteTable) -> Iterator[ConfigurationError]:
     """Yield an error for each extra that the table needs and that is not, or not wholly, installed."""
     users = {
-        "gateways": ("a gateway", next((each.span for each in table.gateways.values()), None)),
+        "gateways": ("a gateway", next((gateway.span for gateway in table.gateways.values()), None)),
         "recording": ("'record'", table.record.span if table.record else None),
         "foxglove": ("'foxglove'", table.foxglove.span if table.foxglove else None),
     }

@@ -23,7 +23,7 @@ def feeding(route: Route, deadman: Deadman) -> list[Destination]:
     If the route does not send to any of these, return all of its destinations.
     """
     stopped = {to.value for to in deadman.to}
-    return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)
+    return [to for to in route.destinations if to.endpoint.value in stopped] or list(route.destinations)
 
 
 def takes_over(route: Route, endpoint: str, other: Route) -> bool:
@@ -32,7 +32,7 @@ def takes_over(route: Route, endpoint: str, other: Route) -> bool:
     return (
         deadman is not None
         and other.name != route.name
-        and any(each.value in (route.case.value, route.name) for each in deadman.disarmed_by or ())
+        and any(name.value in (route.case.value, route.name) for name in deadman.disarmed_by or ())
         and endpoint in [to.value for to in deadman.to]
     )
 
@@ -40,7 +40,7 @@ def takes_over(route: Route, endpoint: str, other: Route) -> bool:
 def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[str, ...]:
     """Return the routes whose deadmen each command to `destination` feeds or disarms, its own route first."""
     names = (route.case.value, route.name)
-    disarmed = dict.fromkeys(each.name for name in names for each in lookup.disarmed.get(name, ()))
+    disarmed = dict.fromkeys(other.name for name in names for other in lookup.disarmed.get(name, ()))
     others = [name for name in disarmed if takes_over(route, destination.endpoint.value, lookup.routes[name])]
     feeds_own = route.deadman is not None and destination in feeding(route, route.deadman)
     return (route.name, *others) if feeds_own else tuple(others)
@@ -49,10 +49,10 @@ def deadmen_of(lookup: Lookup, route: Route, destination: Destination) -> tuple[
 def successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
     """Return the routes whose commands disarm the deadman. Report names in `disarmed_by` without such a route."""
     table = lookup.table
-    found = [
-        each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
+    others = [
+        other for other in table.routes if any(takes_over(other, to.endpoint.value, route) for to in other.destinations)
     ]
-    served = {name for each in found for name in (each.case.value, each.name)}
+    served = {name for other in others for name in (other.case.value, other.name)}
     broken = [name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")]
     are_known = all(to.value in table.endpoints for to in deadman.to)  # otherwise there is a finding already
     for name in deadman.disarmed_by or ():
@@ -68,13 +68,13 @@ def successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...
             nobody = f"remove it: no other route sends commands to {to}"
             hint = did_you_mean(name.value, _commanding(lookup, route, deadman)) or nobody
             lookup.report(name.span, Code.BAD_VALUE, message, hint)
-    return tuple(each.name for each in found)
+    return tuple(other.name for other in others)
 
 
 def _commanding(lookup: Lookup, route: Route, deadman: Deadman) -> set[str]:
     """Return the payload cases and names of other routes to the endpoints of the deadman."""
-    others = [each for each in lookup.table.routes if each.name != route.name and _shared(each, deadman)]
-    return {name for each in others for name in (each.case.value, each.name)}
+    others = [other for other in lookup.table.routes if other.name != route.name and _shared(other, deadman)]
+    return {name for other in others for name in (other.case.value, other.name)}
 
 
 def _shared(route: Route, deadman: Deadman) -> list[str]:
@@ -108,14 +108,14 @@ def _remedy(lookup: Lookup, route: Route, deadman: Deadman, forgotten: Mapping[s
     # Commands to another motor must not disarm this deadman: it would stay silent as long as they arrive.
     beside = "`because: why`" if deadman.disarmed_by else "`disarmed_by: []`"
     others = [lookup.routes[name] for name in forgotten]
-    unstopped = next((each for each in others if not _stops(each, forgotten[each.name])), None)
+    unstopped = next((other for other in others if not _stops(other, forgotten[other.name])), None)
     if unstopped is not None:  # disarmed by its commands, no deadman would stop the board when they end
         board, name = forgotten[unstopped.name], _written(lookup, unstopped.name)
         return (
             f"add {beside} if they move other motors; if '{name}' takes over from '{route.case.value}', first add "
             f"'{board}' to `to` of its deadman, which does not stop it"
         )
-    named = [each.value for each in deadman.disarmed_by or ()]
+    named = [name.value for name in deadman.disarmed_by or ()]
     names = dict.fromkeys((*named, *(_written(lookup, name) for name in forgotten)))
     value = f"[{', '.join(names)}]" if len(names) > 1 else next(iter(names))
     for other in others:
@@ -136,14 +136,14 @@ def _stops(route: Route, board: str) -> bool:
 def _written(lookup: Lookup, name: str) -> str:
     """Return how to name a route in `disarmed_by`: by its case, unless there are several routes of this case."""
     case = lookup.routes[name].case.value
-    return name if sum(each.case.value == case for each in lookup.table.routes) > 1 else case
+    return name if sum(route.case.value == case for route in lookup.table.routes) > 1 else case
 
 
 def _difference(lookup: Lookup, route: Route, other: Route, board: str) -> str | None:
     """Return a field that commands of two routes of one case to a board set to different constants, or None."""
     if route.case.value != other.case.value:
         return None
-    ours, theirs = (dict(_constants(lookup, each, board)) for each in (route, other))
+    ours, theirs = (dict(_constants(lookup, one, board)) for one in (route, other))
     return next((name for name in ours if name in theirs and ours[name] != theirs[name]), None)
 
 
@@ -163,5 +163,5 @@ def _constants(lookup: Lookup, route: Route, board: str) -> Iterator[tuple[str, 
 
 
 def _field_maps(route: Route, board: str) -> Iterable[FieldMap]:
-    to = [each.fields for each in route.destinations if each.endpoint.value == board]
-    return [fields for fields in (route.fields, *(each.fields for each in route.source_topics), *to) if fields]
+    to = [destination.fields for destination in route.destinations if destination.endpoint.value == board]
+    return [fields for fields in (route.fields, *(topic.fields for topic in route.source_topics), *to) if fields]

@@ -57,14 +57,14 @@ def _pattern_findings(gateway: Gateway) -> Iterator[Diagnostic]:
 
 def _client_topics(lookup: Lookup, gateway: Gateway) -> dict[str, InboundPlan]:
     """Return the topics that clients of a gateway may publish on, except those whose types do not exist."""
-    found: dict[str, InboundPlan | None] = {}
+    plans: dict[str, InboundPlan | None] = {}
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)
-        if name in found:
+        if name in plans:
             message = f"'{name}' is in 'inbound' twice"
             lookup.report(inbound.topic.topic.span, Code.BAD_VALUE, message, "name it once")
-        found[name] = _inbound(lookup, gateway, inbound, name)
-    return {name: plan for name, plan in found.items() if plan}
+        plans[name] = _inbound(lookup, gateway, inbound, name)
+    return {name: plan for name, plan in plans.items() if plan}
 
 
 def _inbound(lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str) -> InboundPlan | None:

@@ -26,7 +26,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
     table, schema, envelope, lowered = checked.table, checked.schema, checked.envelope, checked.lowered
     if table is None or schema is None or envelope is None or lowered is None:
         return None
-    served = [each for each in checked.routes if not each.route.ignore]
+    served = [route for route in checked.routes if not route.route.ignore]
     inbound: dict[int, tuple[RoutePlan, ...]] = {}
     outbound: dict[str, tuple[RoutePlan, ...]] = {}
     for route in served:
@@ -36,8 +36,8 @@ def link(checked: Checked, counters: Counters) -> Program | None:
         for feed in route.subscriptions:
             topic = feed.topic.topic.value
             outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, frozenset(), feed))
-    deadmen = tuple(each.deadman for each in served if each.deadman)
-    destinations = {to.endpoint.value for each in served for to in each.route.destinations}
+    deadmen = tuple(route.deadman for route in served if route.deadman)
+    destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     program = Program(
         table=table,
@@ -45,7 +45,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
         publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
-        subscriptions=_topics((feed.topic, feed.type) for each in served for feed in each.subscriptions),
+        subscriptions=_topics((feed.topic, feed.type) for route in served for feed in route.subscriptions),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,

@@ -36,7 +36,7 @@ class Definitions:
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Return the protos of an envelope. Raises TableError; an invalid folder is read again for each table."""
-        exclude = tuple(each.value for each in settings.exclude)
+        exclude = tuple(entry.value for entry in settings.exclude)
         key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock), exclude
         if key not in self._protos:
             known = self._unchanged(settings)
@@ -46,7 +46,7 @@ class Definitions:
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
         known = self._known
         root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock)
-        exclude = [each.value for each in settings.exclude]
+        exclude = [entry.value for entry in settings.exclude]
         if known is None or (known.root, known.lock, known.exclude) != (root, lock, exclude):
             return None
         if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
@@ -84,39 +84,39 @@ class Lookup:
     @cached_property
     def disarmed(self) -> Mapping[str, Sequence[Route]]:
         """The routes whose deadman names a payload case or a route in `disarmed_by`, by that name."""
-        found: dict[str, list[Route]] = {}
+        by_name: dict[str, list[Route]] = {}
         for route in self.table.routes:
-            for name in {each.value for each in (route.deadman and route.deadman.disarmed_by) or ()}:
-                found.setdefault(name, []).append(route)
-        return found
+            for name in {name.value for name in (route.deadman and route.deadman.disarmed_by) or ()}:
+                by_name.setdefault(name, []).append(route)
+        return by_name
 
     @cached_property
     def routes(self) -> Mapping[str, Route]:
         return {route.name: route for route in self.table.routes}
 
     def case(self, name: Located[str]) -> PayloadCase | None:
-        found = self.envelope.cases.get(name.value)
+        case = self.envelope.cases.get(name.value)
         if (other := self.envelope.unroutable.get(name.value)) is not None:
             message = f"no route can take '{name.value}': it is {other.type}, not a message"
             hint = "wrap it in a message of its own, or ignore it with `ignore: reason`"
             self.report(name.span, Code.BAD_PROTO, message, hint)
-        elif found is None:
+        elif case is None:
             message = f"{self.envelope.name} has no payload case '{name.value}'"
             hint = did_you_mean(name.value, self.envelope.cases)
             self.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
-        return found
+        return case
 
     def endpoint(self, name: Located[str], also: Iterable[str] = ()) -> Endpoint | None:
         """Return the endpoint. If there is none, return None and report that, unless its declaration has a finding.
 
         `also` are other valid names.
         """
-        found = self.table.endpoints.get(name.value)
-        if found is None and f"endpoints/{name.value}" not in self.table.broken:
+        endpoint = self.table.endpoints.get(name.value)
+        if endpoint is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
             hint = _endpoint_hint(name.value, known, is_source=bool(also))
             self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
-        return found
+        return endpoint
 
     def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
         """Return the endpoint `name`, a recipient of payloads of `case` from `sources`; None if it does not exist."""
@@ -136,14 +136,14 @@ class Lookup:
             return None
         name = topic.type.value
         try:
-            found = self.definitions.interfaces.get(name)
+            ros_type = self.definitions.interfaces.get(name)
         except TableError as error:
             self.findings += error.diagnostics
             return None
-        if found is None:
+        if ros_type is None:
             is_default = topic.type.span == topic.topic.span
             self._report_type(topic.type, self.table.package if is_default else None)
-        return found
+        return ros_type
 
     def _report_type(self, name: Located[str], package: Located[str] | None) -> None:
         """Report an unknown type. `package` is the default package if the type was made from it."""
@@ -205,7 +205,7 @@ class Lookup:
 def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str:
     """Return a hint for an endpoint that does not exist."""
     if "," in name:
-        names = [each.strip() for each in name.split(",") if each.strip()]
+        names = [part.strip() for part in name.split(",") if part.strip()]
         return f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
     if is_source and name == "*":
         return f"did you mean '{ANY}'?"
@@ -220,16 +220,16 @@ def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str
 
 def nested_types(declared: Type) -> Iterable[MessageType]:
     """Return a ROS message type and all message types in it, each once."""
-    found: dict[str, MessageType] = {}
+    by_name: dict[str, MessageType] = {}
     waiting: list[Type] = [declared]
     while waiting:
         current = waiting.pop()
         if isinstance(current, List):
             waiting.append(current.element)
-        elif isinstance(current, MessageType) and current.name not in found:
-            found[current.name] = current
+        elif isinstance(current, MessageType) and current.name not in by_name:
+            by_name[current.name] = current
             waiting += [member.type for member in current.fields]
-    return found.values()
+    return by_name.values()
 
 
 def definitions_of(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:

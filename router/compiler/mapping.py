@@ -130,7 +130,9 @@ def _left_out(message: MessageType, rows: Sequence[Row]) -> list[str]:
     """Return the fields of `message` that are not in the rows of an automatic mapping."""
     named = {row.target for row in rows}
     return [
-        path for path in _paths(message, "") if not any(path == each or path.startswith(f"{each}.") for each in named)
+        path
+        for path in _paths(message, "")
+        if not any(path == target or path.startswith(f"{target}.") for target in named)
     ]
 
 
@@ -204,10 +206,10 @@ class _Builder:
         free = [member.name for member in holder.fields if (*entry.path[:depth], member.name) not in self._taken]
         first, last = _of_one_key(entry.path_spans, depth)
         hint = did_you_mean(name, free or [member.name for member in holder.fields])
-        if not nearest(name, free, _MISSPELT) and (found := ways(holder, entry.path[depth:])):
-            behind = sum(len(each) + 1 for each in entry.path[last + 1 :])
-            before = "".join(f"{each}." for each in entry.path[first:depth])
-            hint = one_of([before + way[: len(way) - behind] for way in found])
+        if not nearest(name, free, _MISSPELT) and (meant := ways(holder, entry.path[depth:])):
+            behind = sum(len(step) + 1 for step in entry.path[last + 1 :])
+            before = "".join(f"{step}." for step in entry.path[first:depth])
+            hint = one_of([before + way[: len(way) - behind] for way in meant])
             span = replace(entry.path_spans[first], end_column=entry.path_spans[last].end_column)
         self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, f"{holder} has no field '{name}'", hint))
 
@@ -253,12 +255,12 @@ class _Builder:
             typed = check(entry.value, self.scope, member.type)
             plan = convert(typed, member.type, self.scope)
         except ExpressionError as error:
-            found = error.diagnostic
-            if entry.value.choices is not None and found.span == entry.value.span:
-                found = self._chosen_finding(member, entry.value.choices) or found
+            finding = error.diagnostic
+            if entry.value.choices is not None and finding.span == entry.value.span:
+                finding = self._chosen_finding(member, entry.value.choices) or finding
             if isinstance(member.type, String) and not entry.value.literal and _FRAME.fullmatch(entry.value.text):
-                found = replace(found, hint=f"for text, write {{text: {entry.value.text}}}")
-            self.findings.append(found)
+                finding = replace(finding, hint=f"for text, write {{text: {entry.value.text}}}")
+            self.findings.append(finding)
             return unset(member, entry.value.span)
         self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))
         return plan
@@ -277,10 +279,10 @@ class _Builder:
         try:
             plan = convert(source, member.type, self.scope)
         except ExpressionError as error:
-            found = error.diagnostic
-            message = f"auto cannot fill '{path}': {found.message}"
-            by_hand = "the other fields" if found.code is Code.FORBIDDEN_EXPRESSION else f"'{path}'"
-            self.findings.append(Diagnostic(self.span, found.code, message, f"map {by_hand} by hand: {found.hint}"))
+            finding = error.diagnostic
+            message = f"auto cannot fill '{path}': {finding.message}"
+            by_hand = "the other fields" if finding.code is Code.FORBIDDEN_EXPRESSION else f"'{path}'"
+            self.findings.append(Diagnostic(self.span, finding.code, message, f"map {by_hand} by hand: {finding.hint}"))
             return unset(member, self.span)
         self.rows.append(Row(path, str(member.type), self.origin + path, str(source.kind), automatic=True))
         return plan
@@ -312,8 +314,8 @@ def presence_findings(plan: Plan) -> Iterator[Diagnostic]:
 
 def _oneof_findings(plan: Record) -> Iterator[Diagnostic]:
     first: dict[str, str] = {}
-    for member, made in plan.members:
-        if member.oneof is None or isinstance(made, Unset):
+    for member, filled in plan.members:
+        if member.oneof is None or isinstance(filled, Unset):
             continue
         other = first.setdefault(member.oneof, member.name)
         if other != member.name:
@@ -322,7 +324,7 @@ def _oneof_findings(plan: Record) -> Iterator[Diagnostic]:
 
 
 def _required_findings(plan: Record) -> Iterator[Diagnostic]:
-    for member, made in plan.members:
-        if member.is_required and isinstance(made, Unset):
+    for member, filled in plan.members:
+        if member.is_required and isinstance(filled, Unset):
             message = f"nothing fills '{member.name}', which {plan.type} requires"
             yield Diagnostic(plan.span, Code.MISSING_KEY, message, "map it")

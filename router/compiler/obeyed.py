@@ -53,19 +53,19 @@ def _check_within(lookup: Lookup, deadman: Deadman, obeyed: Obeyed) -> None:
 def _watched(lookup: Lookup, deadman: Deadman, case: Located[str]) -> tuple[str, ...]:
     """Return the endpoints of the deadman that a route takes this case from. Report boards without such a route."""
     table = lookup.table
-    routes = [each for each in table.routes if each.case.value == case.value and each.ignore is None]
-    sources = {source.value for each in routes for source in each.sources}
+    routes = [other for other in table.routes if other.case.value == case.value and other.ignore is None]
+    sources = {source.value for other in routes for source in other.sources}
     is_broken = f"routes/{case.value}" in table.broken  # then it has a finding already
-    found = tuple(to.value for to in deadman.to if {to.value, ANY} & sources)
+    endpoints = tuple(to.value for to in deadman.to if {to.value, ANY} & sources)
     boards = [to.value for to in deadman.to if to.value in lookup.boards]
-    missing = next((name for name in boards if name not in found), None)
-    if missing is None and not found:
+    missing = next((name for name in boards if name not in endpoints), None)
+    if missing is None and not endpoints:
         missing = next((to.value for to in deadman.to if to.value in table.endpoints), None)
     if missing is not None and not is_broken:
         message = f"no route takes '{case.value}' from '{missing}', so nothing shows whether it obeys"
         hint = f"write a case that '{missing}' sends, or add it to the sources of a route of '{case.value}'"
         lookup.report(case.span, Code.BAD_VALUE, message, hint)
-    return found
+    return endpoints
 
 
 def _nodes(node: Node) -> Iterator[Node]:

@@ -189,7 +189,7 @@ class Program:
     @property
     def client_deadmen(self) -> list[DeadmanPlan]:
         """The deadmen of topics that clients of gateways may publish on."""
-        return [each.deadman for gateway in self.gateways for each in gateway.inbound.values() if each.deadman]
+        return [plan.deadman for gateway in self.gateways for plan in gateway.inbound.values() if plan.deadman]
 
     @property
     def protos_sha256(self) -> str:

@@ -105,8 +105,8 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         message, hint = f"'{route.name}' has no targets", f"add {places}, or ignore it with `ignore: reason`"
         lookup.report(route.span, Code.NO_TARGET, message, hint)
     for topic in route.all_topics:
-        found = (topic_name_finding(topic), *qos_findings(topic, publishes=topic in route.topics))
-        lookup.findings += [finding for finding in found if finding]
+        findings = (topic_name_finding(topic), *qos_findings(topic, publishes=topic in route.topics))
+        lookup.findings += [finding for finding in findings if finding]
     checked = (check_outbound if route.is_outbound else check_inbound)(lookup, route, case)
     deadman, obeyed = check_deadman(lookup, route), check_obeyed(lookup, route)
     if deadman is not None and obeyed is not None:
@@ -139,7 +139,7 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
         if name.value in seen:
             lookup.report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
         seen.add(name.value)
-    return [(each, lookup.recipient(case, each.endpoint, sources)) for each in route.destinations]
+    return [(destination, lookup.recipient(case, destination.endpoint, sources)) for destination in route.destinations]
 
 
 def _destination(
@@ -225,20 +225,20 @@ HEADER = "std_msgs/msg/Header"
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
     """Check the topics of a route from ROS, and their mappings to each destination."""
-    found = destinations(lookup, route, case)
+    recipients = destinations(lookup, route, case)
     subscriptions = []
     for topic in route.source_topics:
         name = topic.topic.value
         if next(other for other in route.source_topics if other.topic.value == name) is not topic:
             lookup.report(topic.topic.span, Code.BAD_VALUE, f"topic '{name}' is listed twice", "name it once")
         ros_type = lookup.ros_type(topic)
-        if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, found)):
+        if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, recipients)):
             subscriptions.append(checked)
     return CheckedRoute(route, case, subscriptions=tuple(subscriptions))
 
 
 def _subscription(
-    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
+    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, recipients: Destinations
 ) -> CheckedSubscription | None:
     """Check a topic and its targets. Return None if the type of `item` is unknown: every use would be reported."""
     scope = lookup.scope(ros_type, ros_type)
@@ -252,9 +252,9 @@ def _subscription(
     else:
         scope.absent = _without_for_each(ros_type)
     when = lookup.when(topic.when, scope)
-    own = any(destination.fields for destination, _ in found)  # then the route needs no fields of its own
+    own = any(destination.fields for destination, _ in recipients)  # then the route needs no fields of its own
     targets = []
-    for destination, endpoint in found:
+    for destination, endpoint in recipients:
         fields = destination.fields or route.fields
         whole = scope.variable(ITEM, route.span) if for_each else None
         span = destination.span if own else route.span

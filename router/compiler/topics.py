@@ -93,7 +93,7 @@ def qos_of(topic: Topic) -> QosPlan:
     given = topic.qos
     plan = PROFILES[given.profile.value if given and given.profile else "default"]
     words = [key.name for key in keys_of(Qos) if key.name != "profile"]
-    said = {word: found.value for word in words if (found := getattr(given, word, None)) is not None}
+    said = {word: setting.value for word in words if (setting := getattr(given, word, None)) is not None}
     if topic.queue_depth is not None:
         said["depth"] = topic.queue_depth.value
     return replace(plan, **said)
@@ -146,8 +146,8 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
         for use in uses[1:]:
-            found = (_disagreement(name, first, use) for first in firsts if first is not use)
-            if finding := next(filter(None, found), None):
+            findings = (_disagreement(name, first, use) for first in firsts if first is not use)
+            if finding := next(filter(None, findings), None):
                 yield finding
         for publisher, subscriber in product(uses, uses):
             if publisher.publishes and not subscriber.publishes and publisher.route and subscriber.route:

@@ -28,25 +28,25 @@ CLIENT = "client"
 
 def library_config(config: ZenohConfig | None) -> zenoh.Config:
     """Return the library's configuration. Raises ZError, whose text may contain secrets: see `reason`."""
-    made: zenoh.Config
+    library: zenoh.Config
     if config is None:
-        made = zenoh.Config()
+        library = zenoh.Config()
     elif config.path is not None:
-        made = zenoh.Config.from_file(config.path)
+        library = zenoh.Config.from_file(config.path)
     else:
-        made = zenoh.Config.from_json5(config.text)
-    return made
+        library = zenoh.Config.from_json5(config.text)
+    return library
 
 
 def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
     """Yield findings for settings that the library rejects, and for keys that belong beside `config`."""
     try:
-        made = library_config(config)
+        library = library_config(config)
     except zenoh.ZError as error:
         yield _refusal(config, error)
         return
     for key, ours in OWN_KEYS.items():
-        if not is_default(made, key):
+        if not is_default(library, key):
             span = config.places.get(tuple(key.split("/")), config.span)
             where = f"'{key}' in '{config.path.name}'" if config.path else f"'{key}'"
             message = f"{where} is not allowed in the 'config' of a gateway"

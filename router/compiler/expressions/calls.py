@@ -80,8 +80,10 @@ def _call_of_scalars(function: Function, arguments: Sequence[Node], span: Source
     if function.gives_an_argument and isinstance(kind, FloatKind):
         arguments = [as_kind(argument, kind, scope) for argument in arguments]
     becomes = [parameter.becomes for parameter in _parameters(function, len(arguments))]
-    made = [as_kind(each, kind, scope) if kind else each for each, kind in zip(arguments, becomes, strict=True)]
-    return Call(kind, span, function.name, tuple(made))
+    converted = [
+        as_kind(argument, kind, scope) if kind else argument for argument, kind in zip(arguments, becomes, strict=True)
+    ]
+    return Call(kind, span, function.name, tuple(converted))
 
 
 def _parameters(function: Function, count: int) -> list[Parameter]:

@@ -72,15 +72,15 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
     _require_different(choices, keys)
     values = [check(value, scope, expected) for _, value in choices.values]
     if choices.otherwise is not None:
-        made = check(choices.otherwise, scope, expected)
+        result = check(choices.otherwise, scope, expected)
     else:
         _require_all(subject, keys, span, scope)
-        made, last = values[-1], keys[-1]
+        result, last = values[-1], keys[-1]
         if isinstance(subject.kind, EnumKind):
             keys[-1] = Call(last.kind, last.span, "fit", (subject, last, last))
     for (name, _), key, value in reversed(list(zip(choices.values, keys, values, strict=True))):
-        made = operators.choice(operators.equality(subject, key, name.span), value, made, value.span, scope)
-    return replace(made, span=span)
+        result = operators.choice(operators.equality(subject, key, name.span), value, result, value.span, scope)
+    return replace(result, span=span)
 
 
 def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> Node:
@@ -208,7 +208,7 @@ class _Checker:
         if len(node.ops) > 1 or not isinstance(node.ops[0], (ast.Eq, ast.NotEq, ast.Is, ast.IsNot)):
             return None
         left, right = node.left, node.comparators[0]
-        nulls = [is_null(each, self.scope) for each in (left, right)]
+        nulls = [is_null(side, self.scope) for side in (left, right)]
         return None if nulls[0] == nulls[1] else left if nulls[1] else right
 
     def _unary(self, op: ast.unaryop, operand: Node, span: SourceSpan) -> Node:

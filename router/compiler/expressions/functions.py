@@ -51,8 +51,8 @@ def _always(kind: Kind) -> Rule:
 
 def _integers(nodes: Sequence[Node]) -> list[IntKind] | None:
     """Return the arguments as integers; None if one is a float."""
-    found = [kind for node in nodes if (kind := as_int(node.kind))]
-    return found if len(found) == len(nodes) else None
+    integers = [kind for node in nodes if (kind := as_int(node.kind))]
+    return integers if len(integers) == len(nodes) else None
 
 
 def _double(nodes: Sequence[Node]) -> FloatKind:

@@ -195,8 +195,8 @@ def within_64_bits(extremes: Iterable[int], is_rounded: bool) -> tuple[IntKind |
 
     The kind is None if no integer fits.
     """
-    found = [*extremes]
-    low, high = min(found), max(found)
+    values = [*extremes]
+    low, high = min(values), max(values)
     limits = INT64 if low < 0 else UINT64
     cut = IntKind(max(low, limits.low), min(high, limits.high), is_rounded)
     return (cut if cut.low <= cut.high else None), (cut.low, cut.high) != (low, high)

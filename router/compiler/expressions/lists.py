@@ -103,13 +103,13 @@ def elementwise(make: Make, operands: Sequence[Node], span: SourceSpan, scope: S
             elements.append(variable)
         else:
             elements.append(operand)
-    made = make(elements)
-    return Each(ListKind(made.kind, length), span, tuple(pairs), made)
+    element = make(elements)
+    return Each(ListKind(element.kind, length), span, tuple(pairs), element)
 
 
 def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
     """Return the common length of these lists, None if it is not known."""
-    lengths = sorted({length for each in lists if (length := length_of(each.kind)) is not None})
+    lengths = sorted({length for node in lists if (length := length_of(node.kind)) is not None})
     if len(lengths) > 1:
         message = f"lists of {' and '.join(map(str, lengths))} elements cannot be combined"
         hint = "give them the same length"
@@ -119,11 +119,11 @@ def _common_length(lists: Sequence[Node], span: SourceSpan) -> int | None:
 
 def _require_known_lengths(lists: Sequence[Node]) -> None:
     """Reject a list of unknown length beside a literal."""
-    for each in lists:
-        if length_of(each.kind) is None:
+    for node in lists:
+        if length_of(node.kind) is None:
             message = "only a list of known length can be combined with a list literal"
             hint = "index it, as in [a * x[0], b * x[1]]"
-            raise ExpressionError(each.span, Code.TYPE_MISMATCH, message, hint)
+            raise ExpressionError(node.span, Code.TYPE_MISMATCH, message, hint)
 
 
 def _pick(operand: Node, index: int) -> Node:
@@ -149,7 +149,7 @@ def as_kind(operand: Node, kind: Kind, scope: Scope) -> Node:
         kinds = (
             [item.kind for item in operand.items] if isinstance(operand, ListLiteral) else [element_of(operand.kind)]
         )
-        if not any(_has_to_be_converted(each, wanted) for each in kinds):
+        if not any(_has_to_be_converted(kind, wanted) for kind in kinds):
             return operand
         return elementwise(lambda parts: as_kind(parts[0], wanted, scope), [operand], operand.span, scope)
     if not _has_to_be_converted(operand.kind, kind):

@@ -145,13 +145,14 @@ def require_senders(operands: Sequence[Node], scope: Scope) -> None:
     """Reject a comparison of the sender's name with a text that is not the name of a possible sender."""
     if not scope.sources or not any(map(is_source, operands)):
         return
-    for each in (
-        each for operand in operands for each in (operand.items if isinstance(operand, ListLiteral) else (operand,))
-    ):
-        name = constant_of(each)
+    items = (
+        item for operand in operands for item in (operand.items if isinstance(operand, ListLiteral) else (operand,))
+    )
+    for item in items:
+        name = constant_of(item)
         if isinstance(name, str) and name not in scope.sources:
             message = f"'{name}' is not a source of this route"
-            raise ExpressionError(each.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, scope.sources))
+            raise ExpressionError(item.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, scope.sources))
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
@@ -207,8 +208,8 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> 
     member = holder.kind.type.field(node.attr)
     if member is None:
         message = f"{holder.kind.type} has no field '{node.attr}'"
-        if found := _further(holder.kind.type, node, text):
-            raise ExpressionError(text.span(text.outermost(node)), Code.UNKNOWN_FIELD, message, one_of(found))
+        if further := _further(holder.kind.type, node, text):
+            raise ExpressionError(text.span(text.outermost(node)), Code.UNKNOWN_FIELD, message, one_of(further))
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
     return _readable(field_of(holder, member, span))
@@ -231,10 +232,10 @@ def _further(holder: MessageType, node: ast.Attribute, text: Parsed) -> list[str
     wanted = names.split(".")
     if nearest(node.attr, [known.name for known in holder.fields], _MISSPELT):
         return []
-    found = ways(holder, wanted, with_lists=True)
-    if not found and len(wanted) > 1 and leads(holder, wanted[1:]):
-        found = [".".join(wanted[1:])]
-    return [f"{before}.{way}" for way in found]
+    paths = ways(holder, wanted, with_lists=True)
+    if not paths and len(wanted) > 1 and leads(holder, wanted[1:]):
+        paths = [".".join(wanted[1:])]
+    return [f"{before}.{way}" for way in paths]
 
 
 def _readable(field: Read) -> Read:
@@ -248,18 +249,18 @@ def constant_at(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     holders = scope.holders(holder_name)
     if not holders:
         raise _unknown_path(path, node, text, scope)
-    found = [(holder, constants[node.attr]) for holder in holders if node.attr in (constants := _constants(holder))]
-    if not found:
+    values = [(holder, constants[node.attr]) for holder in holders if node.attr in (constants := _constants(holder))]
+    if not values:
         known = {value for holder in holders for value in _constants(holder)}
         message = f"'{holder_name}' has no value '{node.attr}'"
         elsewhere = "" if nearest(node.attr, known) else _of_an_enum(node.attr, scope)
         hint = elsewhere or did_you_mean(node.attr, known)
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, hint)
-    if len({value for _, value in found}) > 1:
-        names = ", ".join(sorted(holder.name for holder, _ in found))
+    if len({value for _, value in values}) > 1:
+        names = ", ".join(sorted(holder.name for holder, _ in values))
         message = f"'{holder_name}.{node.attr}' is ambiguous between {names}"
         raise ExpressionError(text.span(node), Code.UNKNOWN_ENUM_VALUE, message, "write the enum's full name")
-    holder, value = found[0]
+    holder, value = values[0]
     literal = constant(value, text.span(node))
     return replace(literal, kind=EnumKind(holder)) if isinstance(holder, Enum) else literal
 
@@ -273,11 +274,11 @@ def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scop
         return _no_constant(".".join(path), whole, _of_an_enum(path[-1], scope), None)
     message = f"{scope.message} has no field or enum '{holder_name}'"
     fields, enums = scope.field_names(), scope.holder_names()
-    if not nearest(path[0], fields, _MISSPELT) and (found := _ways(scope, path) or _without_root(path, scope)):
-        return ExpressionError(whole, Code.UNKNOWN_FIELD, message, one_of(found))
-    if found := ways(scope.message, path[:1]):
+    if not nearest(path[0], fields, _MISSPELT) and (paths := _ways(scope, path) or _without_root(path, scope)):
+        return ExpressionError(whole, Code.UNKNOWN_FIELD, message, one_of(paths))
+    if paths := ways(scope.message, path[:1]):
         first = replace(whole, end_column=whole.column + len(path[0]))
-        return ExpressionError(first, Code.UNKNOWN_FIELD, message, one_of(found))
+        return ExpressionError(first, Code.UNKNOWN_FIELD, message, one_of(paths))
     hint = spellings.NAMES.get(path[-1].lower(), "")
     if not hint and (near := nearest(path[0], fields)) and not nearest(holder_name, enums):
         first = replace(whole, end_column=whole.column + len(path[0]))
@@ -289,8 +290,8 @@ def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scop
 def _without_root(path: tuple[str, ...], scope: Scope) -> list[str]:
     """Return what `msg.accel_x` may mean without the first name."""
     for rest in (path[start:] for start in range(1, len(path))):
-        if found := [".".join(rest)] if leads(scope.message, rest) else _ways(scope, rest):
-            return found
+        if paths := [".".join(rest)] if leads(scope.message, rest) else _ways(scope, rest):
+            return paths
     return []
 
 

@@ -75,9 +75,9 @@ def integer(extremes: Iterable[int], span: SourceSpan, is_rounded: bool = False)
 
     Raises ExpressionError if the integer never fits 64 bits.
     """
-    found = [*extremes]
-    kind, is_checked = within_64_bits(found, is_rounded)
-    if kind is None or (is_checked and min(found) == max(found)):
+    values = [*extremes]
+    kind, is_checked = within_64_bits(values, is_rounded)
+    if kind is None or (is_checked and min(values) == max(values)):
         message = "this integer never fits 64 bits"
         raise ExpressionError(span, Code.OUT_OF_RANGE, message, f"write an integer from {INT64.low} to {UINT64.high}")
     return kind, is_checked
@@ -179,20 +179,20 @@ def _literal_as_float(operand: Node) -> Node:
     return Constant(FloatKind(32), operand.span, float(literal)) if isinstance(literal, int) else operand
 
 
-def folded(made: Binary) -> Binary | Constant:
+def folded(operation: Binary) -> Binary | Constant:
     """Evaluate arithmetic of two literals, so that the result is checked against the target."""
-    left, right = constant_of(made.left), constant_of(made.right)
+    left, right = constant_of(operation.left), constant_of(operation.right)
     if left is None or right is None:
-        return made
+        return operation
     try:
-        value = _COMPUTED[made.operator](left, right)
+        value = _COMPUTED[operation.operator](left, right)
     except ArithmeticError as error:
-        raise ExpressionError(made.span, Code.OUT_OF_RANGE, str(error)) from None
+        raise ExpressionError(operation.span, Code.OUT_OF_RANGE, str(error)) from None
     if isinstance(value, float) and not math.isfinite(value):
         raise ExpressionError(
-            made.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is intended"
+            operation.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is intended"
         )
-    return constant(value, made.span)
+    return constant(value, operation.span)
 
 
 def _extremes(op: Operator, left: IntKind, right: IntKind) -> list[int]:

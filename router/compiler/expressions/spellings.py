@@ -79,14 +79,14 @@ def slip(text: str, names: Collection[str]) -> Slip | None:
         is_all = len(_CURLY.split(text)) == 3 and not _CURLY.sub(" ", text[:1] + text[-1:]).strip()
         hint = f"for text, write {{text: {text[1:-1]}}}" if is_all else f"replace it with {quote}, at both ends"
         return Slip(curly.span(), f"'{curly[0]}' is a typographic quote", hint)
-    for found in _UNIT.finditer(bare):
-        unit = found["unit"]
+    for number in _UNIT.finditer(bare):
+        unit = number["unit"]
         if unit not in names:
-            value = _word_before(bare[: found.start()]) or "x"
+            value = _word_before(bare[: number.start()]) or "x"
             hint = "remove it, and write the value in the field's unit"
             hint = f"write radians({value})" if unit in _DEGREES else hint
             hint = f"write {value} / 100 for a fraction" if unit == "%" else hint
-            return Slip(found.span("unit"), f"'{unit}' is a unit, which expressions do not support", hint)
+            return Slip(number.span("unit"), f"'{unit}' is a unit, which expressions do not support", hint)
     if every := _EVERY_ELEMENT.search(bare):
         hint = f"without brackets, {every['list']} means every element; {every['list']}[0] is the first one"
         return Slip(every.span("index"), f"'{every['index']}' names no element", hint)

@@ -48,9 +48,9 @@ class Parsed:
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
             hint = self._of_word(text) or spellings.of_syntax(self._expression.text)
-            if found := spellings.slip(text, self._names):
-                span, reason = self._expression.place.part(*(self._indent + at for at in found.place)), found.what
-                hint = found.hint
+            if slip := spellings.slip(text, self._names):
+                span, reason = self._expression.place.part(*(self._indent + at for at in slip.place)), slip.what
+                hint = slip.hint
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise ExpressionError(
@@ -59,7 +59,7 @@ class Parsed:
 
     def _of_word(self, text: str) -> str:
         """Return a hint if a field whose name is a keyword of expressions is used without `message.`."""
-        words = {found["name"] for found in _LEXEMES.finditer(text) if found["name"] and not found["dot"]}
+        words = {lexeme["name"] for lexeme in _LEXEMES.finditer(text) if lexeme["name"] and not lexeme["dot"]}
         named = sorted(_MEANINGFUL & words & {*self._names})
         return f"write message.{named[0]} for the field '{named[0]}'" if named else ""
 
@@ -81,7 +81,9 @@ class Parsed:
 
     def outermost(self, node: ast.Attribute) -> ast.Attribute:
         """Return the whole `a.b.c.d` that contains `a.b`."""
-        holders = {id(each.value): each for each in ast.walk(self.tree) if isinstance(each, ast.Attribute)}
+        holders = {
+            id(attribute.value): attribute for attribute in ast.walk(self.tree) if isinstance(attribute, ast.Attribute)
+        }
         while outer := holders.get(id(node)):
             node = outer
         return node
@@ -111,10 +113,10 @@ _MARKED = 0xA000
 def _with_words_as_names(text: str) -> str:
     """Replace Python keywords that may be fields by names of the same length that Python parses."""
 
-    def replaced(found: re.Match[str]) -> str:
-        dot, name = found["dot"] or "", found["name"]
+    def replaced(lexeme: re.Match[str]) -> str:
+        dot, name = lexeme["dot"] or "", lexeme["name"]
         if not name or not keyword.iskeyword(name) or (name in _MEANINGFUL and not dot):
-            return found[0]
+            return lexeme[0]
         return dot + chr(_MARKED + ord(name[0])) + name[1:]
 
     return _LEXEMES.sub(replaced, text)

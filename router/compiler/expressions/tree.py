@@ -224,16 +224,16 @@ def whole(number: int, span: SourceSpan) -> Constant:
 
 def parts_of(node: Node) -> Iterator[Node]:
     """Yield the direct children of a node."""
-    for each in fields(node):
-        yield from _nodes_of(getattr(node, each.name))
+    for field in fields(node):
+        yield from _nodes_of(getattr(node, field.name))
 
 
 def _nodes_of(value: object) -> Iterator[Node]:
     if isinstance(value, _NODES):
         yield value
     elif isinstance(value, tuple):
-        for each in value:
-            yield from _nodes_of(each)
+        for item in value:
+            yield from _nodes_of(item)
 
 
 CHECKS = ("fit", "fit_text", "octets", "named", "member")
