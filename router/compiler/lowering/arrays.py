@@ -23,10 +23,10 @@ class Arrays:
     """Addresses of words that hold a pointer although their C type does not show it."""
     _kept: list[object] = field(default_factory=list)
 
-    def add(self, made: T) -> T:
+    def add(self, structure: T) -> T:
         """Take ownership of a structure or an array, and return it."""
-        self.blocks.append(made)
-        return made
+        self.blocks.append(structure)
+        return structure
 
     def array(self, kind: Any, elements: Sequence[Any]) -> Any:
         """Make an array; None (NULL) if there are no elements."""

@@ -31,60 +31,60 @@ def cdr_message(lowering: Lowering, plan: Record) -> list[Placed]:
 class _Writer:
     lowering: Lowering
 
-    def plan(self, made: Plan, path: str) -> Iterator[Placed]:
-        place = Place(made.span, path)
-        match made:
+    def plan(self, plan: Plan, path: str) -> Iterator[Placed]:
+        place = Place(plan.span, path)
+        match plan:
             case Record():
-                for member, inner in made.members:
+                for member, inner in plan.members:
                     yield from self.plan(inner, f"{path}.{member.name}" if path else member.name)
-                if not made.type.fields:
+                if not plan.type.fields:
                     yield from at(place, known(*NO_FIELDS))
             case Unset():
-                yield from at(place, *starmap(known, known_default(made.type, made.default)))
+                yield from at(place, *starmap(known, known_default(plan.type, plan.default)))
             case Leaf():
-                yield from self._leaf(made, place)
+                yield from self._leaf(plan, place)
             case Items():
-                if made.type.length is None:
-                    yield from at(place, known(*known_length(len(made.items))))
-                for item in made.items:
+                if plan.type.length is None:
+                    yield from at(place, known(*known_length(len(plan.items))))
+                for item in plan.items:
                     yield from self.plan(item, path)
             case Each():
-                yield from self._each(made, place)
+                yield from self._each(plan, place)
 
-    def _leaf(self, made: Leaf, place: Place) -> list[Placed]:
-        if made.constant is not None:
-            return at(place, known(*known_value(made.constant, made.type)))
-        value = self.lowering.value(made.node)
-        match made.type:
+    def _leaf(self, leaf: Leaf, place: Place) -> list[Placed]:
+        if leaf.constant is not None:
+            return at(place, known(*known_value(leaf.constant, leaf.type)))
+        value = self.lowering.value(leaf.node)
+        match leaf.type:
             case String():
                 return at(place, value, Operation(Op.PUT_TEXT))
             case Float(bits):
                 put = Op.PUT_FLOAT if bits == 32 else Op.PUT_DOUBLE
-                return at(place, to_real(value, made.node.kind), Operation(put))
+                return at(place, to_real(value, leaf.node.kind), Operation(put))
             case _:
-                return at(place, value, Operation(Op.PUT, size_of(made.type)))
+                return at(place, value, Operation(Op.PUT, size_of(leaf.type)))
 
-    def _each(self, made: Each, place: Place) -> list[Placed]:
-        count, inputs = lower_lists(self.lowering, made)
+    def _each(self, plan: Each, place: Place) -> list[Placed]:
+        count, inputs = lower_lists(self.lowering, plan)
         slot = self.lowering.names.temporary()
         number = at(place, count)
-        if made.type.length is None:
+        if plan.type.length is None:
             number += at(place, keep(slot), Operation(Op.PUT, 4), load(slot))
-        if _are_copied(made, inputs):
+        if _are_copied(plan, inputs):
             (_, _, octets), *_ = inputs
             return [*number, *at(place, Operation(Op.DROP), load(octets), Operation(Op.PUT_BYTES))]
         body = loop(
             self.lowering,
             inputs,
             place,
-            lambda: list(merged(_padded(self.plan(made.element, place.field), Offset()))),
+            lambda: list(merged(_padded(self.plan(plan.element, place.field), Offset()))),
         )
         return [*number, *body]
 
 
-def _are_copied(made: Each, inputs: list[LoopList]) -> bool:
+def _are_copied(plan: Each, inputs: list[LoopList]) -> bool:
     """Return whether bytes are copied to a list of bytes unchanged."""
-    element = made.element
+    element = plan.element
     if len(inputs) > 1 or not isinstance(element, Leaf) or element.type != Int(8, signed=False):
         return False
     variable, of, _ = inputs[0]

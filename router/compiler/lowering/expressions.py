@@ -77,9 +77,9 @@ class Lowering:
         if (level := self._unchanged(node)) is None:
             return self._value(node)
         around, self.names.loops[level:] = self.names.loops[level:], []
-        made = self._value(node)
+        value = self._value(node)
         self.names.loops += around
-        return once(made, self.names.flag(around[0]), self.names.temporary()) if _is_costly(made) else made
+        return once(value, self.names.flag(around[0]), self.names.temporary()) if _is_costly(value) else value
 
     def _unchanged(self, node: tree.Node) -> int | None:
         """Return the index in `loops` of the outermost loop in which a node is invariant; None if there is none."""
@@ -117,7 +117,7 @@ class Lowering:
             case tree.Logic():
                 return chained(Op.AND if node.is_all else Op.OR, list(map(self.value, node.operands)))
             case tree.Choice():
-                branches = (coerced(self.value(each), each.kind, node.kind) for each in (node.body, node.orelse))
+                branches = (coerced(self.value(branch), branch.kind, node.kind) for branch in (node.body, node.orelse))
                 return choice(self.value(node.test), *branches)
             case tree.Call():
                 return functions.called(self, node)
@@ -151,8 +151,8 @@ class Lowering:
         before, holder = self.message(node.holder)
         if isinstance(node.kind, MessageKind):  # the only element of a list
             return routine(before, load(holder.value(node.field)), Operation(Op.ELEMENT, flag=Scalar.IN_CELLS))
-        made = routine(before, load(holder.value(node.field)))
-        return routine(made, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else made
+        value = routine(before, load(holder.value(node.field)))
+        return routine(value, Operation(Op.UTF8)) if _is_unchecked(holder, node.field, node.kind) else value
 
     def time(self, before: Routine, moment: Section) -> Routine:
         """Return the operations that push a message with seconds and nanoseconds as nanoseconds, which always fit."""
@@ -228,8 +228,11 @@ _COSTLY = frozenset({
 """Operations whose time grows with a list, a text or a message."""
 
 
-def _is_costly(made: Routine) -> bool:
-    return any(each.kind in _COSTLY or (each.kind is Op.COMPARE and each.slot == Compared.TEXTS) for each in made)
+def _is_costly(computed: Routine) -> bool:
+    return any(
+        operation.kind in _COSTLY or (operation.kind is Op.COMPARE and operation.slot == Compared.TEXTS)
+        for operation in computed
+    )
 
 
 def _can_be_kept(node: tree.Node) -> bool:

@@ -48,8 +48,8 @@ def called(lowering: Lowering, node: tree.Call) -> Routine:
     if name in _OF_REALS:
         return routine(*map(lowering.real, node.arguments), Operation(_OF_REALS[name]))
     if name in _ROUNDINGS:
-        made = lowering.value(first)
-        return routine(made, Operation(_ROUNDINGS[name])) if isinstance(first.kind, FloatKind) else made
+        value = lowering.value(first)
+        return routine(value, Operation(_ROUNDINGS[name])) if isinstance(first.kind, FloatKind) else value
     if name in _FACTORS:
         return routine(lowering.real(first), real(_FACTORS[name]), Operation(Op.REAL_MULTIPLY))
     if name in _TIMES:
@@ -68,15 +68,15 @@ def _extreme(lowering: Lowering, node: tree.Call) -> Routine:
         return lists.extreme(lowering, node, of_integers, of_reals)
     first, *others = node.arguments
     if isinstance(node.kind, FloatKind):
-        return routine(lowering.real(first), *(routine(lowering.real(each), Operation(of_reals)) for each in others))
-    made, kind = lowering.value(first), first.kind
+        return routine(lowering.real(first), *(routine(lowering.real(other), Operation(of_reals)) for other in others))
+    value, kind = lowering.value(first), first.kind
     pick = min if of_integers is Op.LEAST else max
-    for each in others:
-        (low, high), (low_too, high_too) = bounds(kind), bounds(each.kind)
+    for other in others:
+        (low, high), (low_too, high_too) = bounds(kind), bounds(other.kind)
         result = IntKind(pick(low, low_too), pick(high, high_too))
-        made = routine(made, lowering.value(each), Operation(of_integers, flag=signs(result, kind, each.kind)))
+        value = routine(value, lowering.value(other), Operation(of_integers, flag=signs(result, kind, other.kind)))
         kind = result
-    return made
+    return value
 
 
 def _between(lowering: Lowering, node: tree.Call) -> Routine:
@@ -85,7 +85,7 @@ def _between(lowering: Lowering, node: tree.Call) -> Routine:
     if isinstance(node.kind, FloatKind):
         assert of_reals is not None  # noqa: S101 - wrap() takes integers
         return routine(*map(lowering.real, node.arguments), Operation(of_reals))
-    flag = signs(node.kind, *(each.kind for each in node.arguments))
+    flag = signs(node.kind, *(argument.kind for argument in node.arguments))
     return routine(*map(lowering.value, node.arguments), Operation(of_integers, flag=flag))
 
 
@@ -106,10 +106,10 @@ def _time(lowering: Lowering, node: tree.Node, factor: int) -> Routine:
 
 def _absolute(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
-    made = lowering.value(first)
+    value = lowering.value(first)
     if isinstance(node.kind, FloatKind):
-        return routine(to_real(made, first.kind), Operation(Op.REAL_ABSOLUTE))
-    return routine(made, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else made
+        return routine(to_real(value, first.kind), Operation(Op.REAL_ABSOLUTE))
+    return routine(value, Operation(Op.ABSOLUTE)) if bounds(first.kind)[0] < 0 else value
 
 
 def _seconds(lowering: Lowering, node: tree.Call) -> Routine:
@@ -123,13 +123,13 @@ def _named(lowering: Lowering, node: tree.Call) -> Routine:
     """Lower the conversion of an enum's name to its number. Other text is rejected."""
     assert isinstance(node.kind, EnumKind)  # noqa: S101 - as `tree.CHECKS` says
     slot = lowering.names.temporary()
-    found: Routine = (load(slot), Operation(Op.NAMELESS))
+    numbers: Routine = (load(slot), Operation(Op.NAMELESS))
     for name, number in reversed(node.kind.enum.values):
         is_it = load(slot), text(name.encode()), Operation(Op.COMPARE, int(Compared.TEXTS), flag=Relation.EQUAL)
-        found = routine(
-            is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(found)), found
+        numbers = routine(
+            is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(numbers)), numbers
         )
-    return routine(lowering.value(node.arguments[0]), keep(slot), DROP, found)
+    return routine(lowering.value(node.arguments[0]), keep(slot), DROP, numbers)
 
 
 def _member(lowering: Lowering, node: tree.Call) -> Routine:
@@ -165,14 +165,14 @@ def longest(node: tree.Node) -> int:
 
 def _str(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
-    made = lowering.value(first)
+    value = lowering.value(first)
     if isinstance(first.kind, StringKind):
-        return made
+        return value
     if isinstance(first.kind, BoolKind):
         yes, no = text(b"True"), text(b"False")
-        return routine(made, Operation(Op.UNLESS, size=2), yes, Operation(Op.JUMP, size=1), no)
+        return routine(value, Operation(Op.UNLESS, size=2), yes, Operation(Op.JUMP, size=1), no)
     lowering.names.count_text(_LONGEST_DECIMAL, node.span)
-    return routine(made, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
+    return routine(value, Operation(Op.DECIMAL, flag=is_unsigned(first.kind)))
 
 
 def _text(lowering: Lowering, node: tree.Call) -> Routine:
@@ -199,8 +199,8 @@ def _octets(lowering: Lowering, node: tree.Call) -> Routine:
     (first,) = node.arguments
     if (known := tree.constant_bytes(node)) is not None:
         return (text(known),)
-    made = lists.lower_list(lowering, first)
-    return made.routine if made.is_octets else routine(made.routine, Operation(Op.OCTETS, flag=made.scalar))
+    listed = lists.lower_list(lowering, first)
+    return listed.routine if listed.is_octets else routine(listed.routine, Operation(Op.OCTETS, flag=listed.scalar))
 
 
 def _same(lowering: Lowering, node: tree.Call) -> Routine:

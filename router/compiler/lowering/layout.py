@@ -127,20 +127,20 @@ class _ProtobufNumbering(Numbering):
     def place(self, section: Section) -> None:
         first = len(self.defaults)
         declared = {name: section.declared(wanted.member) for name, wanted in section.wanted.items()}
-        alone = [name for name, each in declared.items() if each.containing_oneof is None]
+        alone = [name for name, member in declared.items() if member.containing_oneof is None]
         fields = [self._field(declared[name], section.wanted[name]) for name in alone]
-        oneofs = {each.containing_oneof for each in declared.values() if each.containing_oneof is not None}
-        for oneof in sorted(oneofs, key=lambda each: each.index):
+        oneofs = {member.containing_oneof for member in declared.values() if member.containing_oneof is not None}
+        for oneof in sorted(oneofs, key=lambda oneof: oneof.index):
             choice, begin = self.number(Slot(0, f"member of {section.path}{oneof.name}")), len(self.defaults)
             members = [self._field(member, section.wanted.get(member.name)) for member in oneof.fields]
             count = len(self.defaults) - begin
-            fields += [each._replace(choice=choice, cleared=begin, cleared_count=count) for each in members]
-        fields.sort(key=lambda each: each.number)
+            fields += [member._replace(choice=choice, cleared=begin, cleared_count=count) for member in members]
+        fields.sort(key=lambda field: field.number)
         self.sections[section.index] = PlacedSection(tuple(fields), first, len(self.defaults) - first)
 
     def _field(self, declared: FieldDescriptor, wanted: Wanted | None) -> WantedField:
         slots = (wanted.value, wanted.presence) if wanted is not None else (None, None)
-        slot, presence = (self.number(each) if each is not None else NONE for each in slots)
+        slot, presence = (self.number(wanted_slot) if wanted_slot is not None else NONE for wanted_slot in slots)
         section = wanted.section if wanted is not None else None
         if section is not None:
             self.place(section)

@@ -103,8 +103,8 @@ def _read(lowering: Lowering, node: tree.Read) -> StoredList:
     element = node.kind.element
     message = holder.inner(node.field) if isinstance(element, (MessageKind, TimeKind)) else None
     is_unchecked = isinstance(element, StringKind) and holder.is_unchecked(node.field)
-    made = routine(before, load(holder.value(node.field)))
-    return StoredList(made, holder.stored(node.field), element, message, is_unchecked)
+    value = routine(before, load(holder.value(node.field)))
+    return StoredList(value, holder.stored(node.field), element, message, is_unchecked)
 
 
 def _payloads(lowering: Lowering, node: tree.Variable) -> StoredList:
@@ -125,14 +125,14 @@ def _listed(lowering: Lowering, node: tree.ListLiteral) -> StoredList:
         message = Section(element.type, None, "[].")  # only ROS messages are values
     if len(items) <= _MOST_STACKED:
         return StoredList(routine(*items, Operation(Op.LIST, size=len(items))), Scalar.IN_CELLS, element, message)
-    made = lowering.names.temporary()
-    appended = (routine(item, Operation(Op.APPEND, made)) for item in items)
-    return StoredList(routine(_empty_list(made), *appended, load(made)), Scalar.IN_CELLS, element, message)
+    filled = lowering.names.temporary()
+    appended = (routine(item, Operation(Op.APPEND, filled)) for item in items)
+    return StoredList(routine(_empty_list(filled), *appended, load(filled)), Scalar.IN_CELLS, element, message)
 
 
-def _empty_list(made: Slot) -> Routine:
+def _empty_list(slot: Slot) -> Routine:
     """Return the operations that put an empty list into a slot."""
-    return Operation(Op.LIST, size=0), keep(made), DROP
+    return Operation(Op.LIST, size=0), keep(slot), DROP
 
 
 def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
@@ -140,14 +140,14 @@ def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
 
 
 def _computed(lowering: Lowering, node: tree.Each) -> StoredList:
-    made = lowering.names.temporary()
+    slot = lowering.names.temporary()
 
     def append() -> Routine:
         element = node.kind.element
         assert element is not None  # noqa: S101 - it is computed
-        return routine(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, made))
+        return routine(lowering.value(node.element), *_as(node.element.kind, element), Operation(Op.APPEND, slot))
 
-    filled = routine(_empty_list(made), lower_loop(lowering, node.lists, append, keeps=True), load(made))
+    filled = routine(_empty_list(slot), lower_loop(lowering, node.lists, append, keeps=True), load(slot))
     message: Section | None = None
     if isinstance(node.kind.element, MessageKind):
         message = Section(node.kind.element.type, None, "[].")  # only ROS messages are values
@@ -156,9 +156,9 @@ def _computed(lowering: Lowering, node: tree.Each) -> StoredList:
 
 def _chosen(lowering: Lowering, node: tree.Choice) -> StoredList:
     """Lower a choice between two lists. Both are converted to the same storage and kind of elements."""
-    body, orelse = (lower_list(lowering, each) for each in (node.body, node.orelse))
+    body, orelse = (lower_list(lowering, branch) for branch in (node.body, node.orelse))
     if isinstance(node.kind, ListKind) and node.kind.element is not None:
-        body, orelse = (_with_elements(lowering, each, node.kind.element) for each in (body, orelse))
+        body, orelse = (_with_elements(lowering, branch, node.kind.element) for branch in (body, orelse))
     if body.scalar is not orelse.scalar:
         body, orelse = map(_in_cells, (body, orelse))
     return replace(body, routine=choice(lowering.value(node.test), body.routine, orelse.routine))
@@ -177,12 +177,12 @@ def _with_elements(lowering: Lowering, values: StoredList, element: Kind) -> Sto
     is_moment = isinstance(element, TimeKind) and values.message is not None
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
         return replace(values, element=element)
-    made, each = lowering.names.temporary(), lowering.names.temporary()
-    start = routine(_empty_list(made), values.routine, keep(each), SIZE)
-    taken, meaning = _take_element(lowering, values, each)
+    filled, element_slot = lowering.names.temporary(), lowering.names.temporary()
+    start = routine(_empty_list(filled), values.routine, keep(element_slot), SIZE)
+    taken, meaning = _take_element(lowering, values, element_slot)
     one = lowering.time((), meaning) if isinstance(meaning, Section) else ()
-    body = routine(taken, one, *_as(kind, element), Operation(Op.APPEND, made))
-    return StoredList(routine(start, repeat(body, keeps=True), load(made)), Scalar.IN_CELLS, element)
+    body = routine(taken, one, *_as(kind, element), Operation(Op.APPEND, filled))
+    return StoredList(routine(start, repeat(body, keeps=True), load(filled)), Scalar.IN_CELLS, element)
 
 
 # ---- loops
@@ -206,16 +206,16 @@ LoopList = tuple[str, StoredList, Slot]
 
 def lower_lists(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> tuple[Routine, list[LoopList]]:
     """Lower the lists of a loop: copy them to slots, and push their length, which must be the same."""
-    made: Routine = ()
+    count: Routine = ()
     inputs: list[LoopList] = []
     for variable, values in lists:
         of = lower_list(lowering, values)
         slot = lowering.names.temporary()
-        made = routine(made, of.routine, keep(slot), SIZE)
+        count = routine(count, of.routine, keep(slot), SIZE)
         if inputs:
-            made = routine(made, Operation(Op.SAME_COUNT))
+            count = routine(count, Operation(Op.SAME_COUNT))
         inputs.append((variable, of, slot))
-    return made, inputs
+    return count, inputs
 
 
 def loop_body(lowering: Lowering, inputs: Sequence[LoopList], body: Callable[[], Routine]) -> tuple[Routine, Routine]:
@@ -242,17 +242,17 @@ def _take_element(lowering: Lowering, of: StoredList, slot: Slot) -> tuple[Routi
     return ((taken, Operation(Op.UTF8)) if of.is_unchecked else (taken,)), None
 
 
-def _elide_slot(made: Routine) -> Routine:
+def _elide_slot(body: Routine) -> Routine:
     """Leave an element on the stack instead of storing, dropping and loading it, if it is used only once."""
-    for index, operation in enumerate(made[:-2]):
+    for index, operation in enumerate(body[:-2]):
         if operation.kind is Op.KEEP:
             slot = operation.slot
-            is_direct = made[index + 1].kind is Op.DROP and made[index + 2] == Operation(Op.LOAD, slot)
-            uses = sum(each.slot is slot for each in made)
-            return (*made[:index], *made[index + 3 :]) if is_direct and uses == 2 else made
+            is_direct = body[index + 1].kind is Op.DROP and body[index + 2] == Operation(Op.LOAD, slot)
+            uses = sum(operation.slot is slot for operation in body)
+            return (*body[:index], *body[index + 3 :]) if is_direct and uses == 2 else body
         if operation.kind not in (Op.NEXT, Op.UTF8):
             break
-    return made
+    return body
 
 
 # ---- elements
@@ -268,10 +268,10 @@ def enter_element(lowering: Lowering, node: tree.Element) -> tuple[Routine, Sect
     """Lower a message in a list. Return the operations that read it into a section, and the section."""
     of = lower_list(lowering, node.values)
     assert of.message is not None  # noqa: S101 - the caller ensures it
-    made = lowering.names.element(of.message)
+    section = lowering.names.element(of.message)
     return routine(
-        of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, made)
-    ), made
+        of.routine, Operation(Op.ELEMENT, flag=of.scalar, number=node.index), Operation(Op.ENTER, section)
+    ), section
 
 
 def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
@@ -303,7 +303,7 @@ def length(lowering: Lowering, node: tree.Node) -> Routine:
 def contains(lowering: Lowering, node: tree.Contains) -> Routine:
     """Lower `in`. All elements are evaluated."""
     sought = lowering.names.temporary()
-    found = routine(lowering.value(node.sought), keep(sought), DROP, integer(0))
+    result = routine(lowering.value(node.sought), keep(sought), DROP, integer(0))
     again = (load(sought),)
 
     def look(one: Routine, kind: Kind) -> Routine:
@@ -311,10 +311,10 @@ def contains(lowering: Lowering, node: tree.Contains) -> Routine:
         return routine(is_it, Operation(Op.EITHER))
 
     if isinstance(node.values, tree.ListLiteral):
-        found = routine(found, *(look(lowering.value(item), item.kind) for item in node.values.items))
+        result = routine(result, *(look(lowering.value(item), item.kind) for item in node.values.items))
     else:
-        found = routine(found, _folded(lowering, node.values, look))
-    return routine(found, Operation(Op.NOT)) if node.is_negated else found
+        result = routine(result, _folded(lowering, node.values, look))
+    return routine(result, Operation(Op.NOT)) if node.is_negated else result
 
 
 def total(lowering: Lowering, node: tree.Call) -> Routine:
@@ -346,11 +346,11 @@ def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) 
 def _folded(lowering: Lowering, values: tree.Node, step: Callable[[Routine, Kind], Routine]) -> Routine:
     """Return a loop that combines each element with the top of the stack. A computed list is not stored."""
     if isinstance(values, tree.Each):
-        each = values
+        loop = values
     else:
         kind = element_of(values.kind)
         assert kind is not None  # noqa: S101 - it is compared or added
         name = f"element {len(lowering.names.temporaries)}"
         listed = values.kind if isinstance(values.kind, ListKind) else ListKind(kind)
-        each = tree.Each(listed, values.span, ((name, values),), tree.Variable(kind, values.span, name))
-    return lower_loop(lowering, each.lists, lambda: step(lowering.value(each.element), each.element.kind))
+        loop = tree.Each(listed, values.span, ((name, values),), tree.Variable(kind, values.span, name))
+    return lower_loop(lowering, loop.lists, lambda: step(lowering.value(loop.element), loop.element.kind))

@@ -51,10 +51,10 @@ def merged(placed: Iterable[Placed]) -> Iterator[Placed]:
         yield last
 
 
-def lower_lists(lowering: Lowering, made: Each) -> tuple[Routine, list[LoopList]]:
+def lower_lists(lowering: Lowering, plan: Each) -> tuple[Routine, list[LoopList]]:
     """Lower the lists that fill a field, as `lists.lower_lists`. A length that the field cannot hold is rejected."""
-    count, inputs = lists.lower_lists(lowering, made.lists)
-    declared = made.type
+    count, inputs = lists.lower_lists(lowering, plan.lists)
+    declared = plan.type
     assert isinstance(declared, List)  # noqa: S101 - an Each fills one
     if declared.length is not None:
         return routine(count, Operation(Op.FIT_COUNT, number=declared.length)), inputs
@@ -71,8 +71,8 @@ def loop(lowering: Lowering, inputs: list[LoopList], place: Place, body: Callabl
         placed.extend(body())
         return tuple(operation for operation, _ in placed)
 
-    before, made = lists.loop_body(lowering, inputs, lowered)
-    front = len(made) - len(placed)
+    before, turn = lists.loop_body(lowering, inputs, lowered)
+    front = len(turn) - len(placed)
     places = [place] * front + [own for _, own in placed]
-    opening, *_, closing = repeat(made)
-    return [*at(place, before), (opening, place), *zip(made, places, strict=True), (closing, place)]
+    opening, *_, closing = repeat(turn)
+    return [*at(place, before), (opening, place), *zip(turn, places, strict=True), (closing, place)]

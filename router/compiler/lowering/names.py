@@ -51,10 +51,10 @@ class Names:
 
     def flag(self, loop: Loop) -> Flag:
         """Return a new flag that is cleared before a loop."""
-        made = Flag(0)
-        self.temporaries.append(made)
-        loop.flags.append(made)
-        return made
+        flag = Flag(0)
+        self.temporaries.append(flag)
+        loop.flags.append(flag)
+        return flag
 
     def element(self, like: Section) -> Section:
         """Return a new section for an element of a list, with the type and path of `like`."""

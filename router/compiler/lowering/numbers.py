@@ -39,29 +39,29 @@ def signs(result: Kind, *operands: Kind) -> int:
     return unsigned + int(Sign.RESULT_UNSIGNED) * is_unsigned(result)
 
 
-def to_real(made: Routine, kind: Kind) -> Routine:
+def to_real(value: Routine, kind: Kind) -> Routine:
     """Convert a number to a real number."""
     if isinstance(kind, FloatKind):
-        return made
-    return routine(made, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
+        return value
+    return routine(value, Operation(Op.INTEGER_TO_REAL, flag=is_unsigned(kind)))
 
 
-def coerced(made: Routine, kind: Kind, to: Kind) -> Routine:
+def coerced(value: Routine, kind: Kind, to: Kind) -> Routine:
     """Convert a value of `kind` to the common kind `to`."""
     if isinstance(to, FloatKind):
-        return to_real(made, kind)
+        return to_real(value, kind)
     if isinstance(to, IntKind) and not isinstance(kind, BoolKind):
-        return fitted(made, kind, to) if is_unsigned(kind) and not is_unsigned(to) else made
-    return made
+        return fitted(value, kind, to) if is_unsigned(kind) and not is_unsigned(to) else value
+    return value
 
 
-def fitted(made: Routine, kind: Kind, to: Kind) -> Routine:
+def fitted(value: Routine, kind: Kind, to: Kind) -> Routine:
     """Add operations that reject an integer outside the range of the kind `to`."""
     (low, high), (least, most) = bounds(kind), bounds(to)
     if least <= low and high <= most:
-        return made
+        return value
     ends = IntKind(least, least), IntKind(most, most)
-    return routine(made, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
+    return routine(value, integer(least), integer(most), Operation(Op.FIT, flag=signs(to, kind, *ends)))
 
 
 _SWAPPED: Mapping[Relation, Relation] = {

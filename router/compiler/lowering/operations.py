@@ -46,13 +46,13 @@ Routine = tuple[Operation, ...]
 
 def routine(*parts: Operation | Routine) -> Routine:
     """Concatenate operations and routines."""
-    made: list[Operation] = []
+    operations: list[Operation] = []
     for part in parts:
         if isinstance(part, Operation):
-            made.append(part)
+            operations.append(part)
         else:
-            made += part
-    return tuple(made)
+            operations += part
+    return tuple(operations)
 
 
 def integer(number: int) -> Operation:
@@ -92,11 +92,11 @@ def repeat(body: Routine, *, keeps: bool = False) -> Routine:
 
 def chained(op: Op, routines: Sequence[Routine]) -> Routine:
     """Return a chain of conditions; evaluation stops once the result is known."""
-    left, made = sum(map(len, routines)) + len(routines) - 1, list[Operation]()
-    for each in routines[:-1]:
-        left -= len(each) + 1
-        made += *each, Operation(op, size=left)
-    return (*made, *routines[-1])
+    left, operations = sum(map(len, routines)) + len(routines) - 1, list[Operation]()
+    for condition in routines[:-1]:
+        left -= len(condition) + 1
+        operations += *condition, Operation(op, size=left)
+    return (*operations, *routines[-1])
 
 
 def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
@@ -104,9 +104,9 @@ def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
     return routine(test, Operation(Op.UNLESS, size=len(body) + 1), body, Operation(Op.JUMP, size=len(orelse)), orelse)
 
 
-def once(made: Routine, flag: Flag, kept: Slot) -> Routine:
-    """Return `made` for a loop: it is computed on first use and then kept. `flag` is 0 before the loop."""
-    return choice((load(flag),), (load(kept),), routine(made, keep(kept), integer(1), keep(flag), DROP))
+def once(computed: Routine, flag: Flag, kept: Slot) -> Routine:
+    """Return `computed` for a loop: it is computed on first use and then kept. `flag` is 0 before the loop."""
+    return choice((load(flag),), (load(kept),), routine(computed, keep(kept), integer(1), keep(flag), DROP))
 
 
 # ---- static analysis

@@ -37,26 +37,26 @@ class _Writer:
     lowering: Lowering
 
     def record(self, plan: Record, descriptor: Descriptor, path: str) -> Iterator[Placed]:
-        for member, made in sorted(plan.members, key=lambda each: each[0].number):
-            yield from self._field(made, descriptor.fields_by_name[member.name], f"{path}.{member.name}".lstrip("."))
+        for member, inner in sorted(plan.members, key=lambda filled: filled[0].number):
+            yield from self._field(inner, descriptor.fields_by_name[member.name], f"{path}.{member.name}".lstrip("."))
 
-    def _field(self, made: Plan, to: FieldDescriptor, path: str) -> Iterator[Placed]:
-        place = Place(made.span, path)
-        match made:
+    def _field(self, plan: Plan, to: FieldDescriptor, path: str) -> Iterator[Placed]:
+        place = Place(plan.span, path)
+        match plan:
             case Leaf():
                 is_entry = container(to).GetOptions().map_entry
-                yield from self._leaf(made, to, place, is_always=to.has_presence or is_entry)
+                yield from self._leaf(plan, to, place, is_always=to.has_presence or is_entry)
             case Record():
-                yield from self._message(made, to, place)
+                yield from self._message(plan, to, place)
             case Items():
-                yield from self._items(made, to, place)
+                yield from self._items(plan, to, place)
             case Each():
-                yield from self._each(made, to, place)
+                yield from self._each(plan, to, place)
             case Unset():
                 pass
 
-    def _message(self, made: Record, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
-        inside = self.record(made, message_of(to), place.field)
+    def _message(self, record: Record, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        inside = self.record(record, message_of(to), place.field)
         if to.type != FieldDescriptor.TYPE_GROUP:
             yield from _delimited(_tag(to), inside, place)
             return
@@ -64,39 +64,39 @@ class _Writer:
         yield from inside
         yield from at(place, known(varint(to.number << 3 | GROUP_END)))
 
-    def _items(self, made: Items, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
-        elements = (placed for item in made.items for placed in self._element(item, to, place.field))
+    def _items(self, items: Items, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        elements = (placed for item in items.items for placed in self._element(item, to, place.field))
         if to.is_packed:
             yield from _packed(to, elements, place)
         else:
             yield from elements
 
-    def _each(self, made: Each, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
-        count, inputs = lower_lists(self.lowering, made)
-        body = loop(self.lowering, inputs, place, lambda: list(merged(self._element(made.element, to, place.field))))
+    def _each(self, plan: Each, to: FieldDescriptor, place: Place) -> Iterator[Placed]:
+        count, inputs = lower_lists(self.lowering, plan)
+        body = loop(self.lowering, inputs, place, lambda: list(merged(self._element(plan.element, to, place.field))))
         elements = [*at(place, count), *body]
         yield from _packed(to, elements, place) if to.is_packed else elements
 
-    def _element(self, made: Plan, to: FieldDescriptor, path: str) -> Iterable[Placed]:
+    def _element(self, plan: Plan, to: FieldDescriptor, path: str) -> Iterable[Placed]:
         """Write an element of a repeated field, even if it is zero."""
-        place = Place(made.span, path)
-        if isinstance(made, Leaf):
-            return self._leaf(made, to, place, is_always=True)
-        assert isinstance(made, Record)  # noqa: S101 - there are no lists in lists
-        return self._message(made, to, place)
+        place = Place(plan.span, path)
+        if isinstance(plan, Leaf):
+            return self._leaf(plan, to, place, is_always=True)
+        assert isinstance(plan, Record)  # noqa: S101 - there are no lists in lists
+        return self._message(plan, to, place)
 
-    def _leaf(self, made: Leaf, to: FieldDescriptor, place: Place, *, is_always: bool) -> list[Placed]:
+    def _leaf(self, leaf: Leaf, to: FieldDescriptor, place: Place, *, is_always: bool) -> list[Placed]:
         tag = 0 if to.is_packed else _tag(to)
-        if made.constant is not None:
-            data = _encoded(made.constant, to)
-            is_written = is_always or _is_set(made.constant, to)
+        if leaf.constant is not None:
+            data = _encoded(leaf.constant, to)
+            is_written = is_always or _is_set(leaf.constant, to)
             return at(place, known(varint(tag) * bool(tag) + data)) if is_written else []
         write = encoding_of(to).write
-        return at(place, self._value(made, write), Operation(write, flag=is_always, size=tag))
+        return at(place, self._value(leaf, write), Operation(write, flag=is_always, size=tag))
 
-    def _value(self, made: Leaf, write: Op) -> Routine:
-        value = self.lowering.value(made.node)
-        return to_real(value, made.node.kind) if write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE) else value
+    def _value(self, leaf: Leaf, write: Op) -> Routine:
+        value = self.lowering.value(leaf.node)
+        return to_real(value, leaf.node.kind) if write in (Op.WRITE_FLOAT, Op.WRITE_DOUBLE) else value
 
 
 def _tag(to: FieldDescriptor) -> int:

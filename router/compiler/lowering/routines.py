@@ -24,8 +24,8 @@ class Routines:
     def routine(self, routine: Routine) -> c.Routine:
         if not routine:
             return c.Routine()
-        made = self.arrays.add((c.Operation * len(routine))())
-        for to, (kind, slot, flag, size, number, data) in zip(made, routine, strict=True):
+        operations = self.arrays.add((c.Operation * len(routine))())
+        for to, (kind, slot, flag, size, number, data) in zip(operations, routine, strict=True):
             if data:
                 number = len(self._literals)  # noqa: PLW2901 - the position of the data
                 self._literals += data
@@ -35,14 +35,14 @@ class Routines:
                 to.real = number
             else:
                 to.integer = number
-        return c.Routine(operations=made, count=len(routine))
+        return c.Routine(operations=operations, count=len(routine))
 
     def layout(self) -> Any:
         """Return a pointer to the layout. Call it once all routines are made, as it contains their literals."""
         layout = self._layout
         sections = [self._section(section) for section in layout.sections]
         closed = [self._closed(numbers) for numbers in layout.closed]
-        made = c.Layout(
+        native = c.Layout(
             sections=self.arrays.array(c.Section, sections),
             defaults=native_values(layout.defaults, self.arrays),
             closed=self.arrays.array(c.ClosedEnum, closed),
@@ -50,16 +50,16 @@ class Routines:
             slot_count=len(layout.defaults),
             is_cdr=layout.is_cdr,
         )
-        return ctypes.pointer(self.arrays.add(made))
+        return ctypes.pointer(self.arrays.add(native))
 
     def _section(self, section: PlacedSection) -> c.Section:
-        made = c.Section(count=len(section.reads), first_slot=section.first_slot, slot_count=section.slot_count)
+        native = c.Section(count=len(section.reads), first_slot=section.first_slot, slot_count=section.slot_count)
         reads = [*map(_native_read, section.reads)]
         if self._layout.is_cdr:
-            made.steps = self.arrays.array(c.ReadOperation, reads)
+            native.steps = self.arrays.array(c.ReadOperation, reads)
         else:
-            made.fields = self.arrays.array(c.WantedField, reads)
-        return made
+            native.fields = self.arrays.array(c.WantedField, reads)
+        return native
 
     def _closed(self, numbers: Sequence[int]) -> c.ClosedEnum:
         return c.ClosedEnum(numbers=self.arrays.array(ctypes.c_int32, numbers), count=len(numbers))
@@ -73,8 +73,8 @@ def _native_read(read: WantedField | ReadOperation) -> c.WantedField | c.ReadOpe
 
 def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) -> Any:
     """Make the contents of slots; None stands for an empty list."""
-    made = arrays.add((c.Value * len(values))())
-    for to, value in zip(made, values, strict=True):
+    natives = arrays.add((c.Value * len(values))())
+    for to, value in zip(natives, values, strict=True):
         if isinstance(value, bytes):
             to.bytes, to.size = arrays.text(value), len(value)
             arrays.references.append(ctypes.addressof(to))
@@ -82,4 +82,4 @@ def native_values(values: Sequence[int | float | bytes | None], arrays: Arrays) 
             to.real = value
         else:
             to.integer = value or 0
-    return made
+    return natives

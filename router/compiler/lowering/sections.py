@@ -93,7 +93,7 @@ class Section:
         return self.is_cdr or member.is_unchecked
 
     def depth(self) -> int:
-        return 1 + max((each.section.depth() for each in self.wanted.values() if each.section), default=0)
+        return 1 + max((field.section.depth() for field in self.wanted.values() if field.section), default=0)
 
     def _default(self, member: Member) -> int | float | bytes | None:
         if isinstance(member.type, (List, MessageType)):

@@ -73,17 +73,17 @@ class _Source:
 
         `is_bounded`: the receive thread evaluates it.
         """
-        given = [each for each in conditions if each is not None]
+        given = [condition for condition in conditions if condition is not None]
         if not given:
             return (), ""
-        routine = chained(Op.AND, [lowering.value(each) for each in given])
+        routine = chained(Op.AND, [lowering.value(condition) for condition in given])
         _require_small([(operation, given[-1].span) for operation in routine])
         if is_bounded and (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
             limit = f"the limit for a destination's `when` is {MOST_CONDITION_OPERATIONS:,}"
             message = f"this could take {most:,} operations on the longest datagram; {limit}"
             hint = f"a list counts as {MAX_DATAGRAM:,} elements: use fewer lists, or use them less often"
             raise TooLargeError(given[-1].span, message, hint)
-        return routine, ", or ".join(f"{each.span}: when" for each in given)
+        return routine, ", or ".join(f"{condition.span}: when" for condition in given)
 
 
 class Datagram(_Source):
@@ -97,17 +97,17 @@ class Datagram(_Source):
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
         collect = checked.collect if targets[0].topic else None
         if collect is None:
-            made = {target.label: self._target(target, "") for target in targets}
-            return LoweredRoute(made, self.layout(checked.route.span))
+            by_label = {target.label: self._target(target, "") for target in targets}
+            return LoweredRoute(by_label, self.layout(checked.route.span))
         by, count, order = map(self._number, (collect.by, collect.count, collect.order))
         frame = Slot(None, tree.ITEMS), Slot(0, tree.COUNT)
         self.add(*frame)
-        made = {target.label: self._target(target, f"{collect.span}: collect") for target in targets}
+        by_label = {target.label: self._target(target, f"{collect.span}: collect") for target in targets}
         layout = self.layout(checked.route.span)
         is_text = isinstance(collect.by.kind, StringKind)
         signed = signs(UINT32, collect.count.kind, collect.order.kind)
-        lowered = LoweredCollect(by, count, order, is_text, signed, *_used(frame, made.values()))
-        return LoweredRoute(made, layout, lowered)
+        lowered = LoweredCollect(by, count, order, is_text, signed, *_used(frame, by_label.values()))
+        return LoweredRoute(by_label, layout, lowered)
 
     def _target(self, target: CheckedTarget, place: str) -> LoweredTarget:
         """Lower a topic, or a destination, which gets the datagram as received."""
@@ -210,7 +210,7 @@ class Constants(_Source):
         placed = protobuf_message(lowering, plan, case) if case is not None else cdr_message(lowering, plan)
         _require_small([(operation, place.span) for operation, place in placed])
         layout = _small(cdr_layout(self.temporaries, self.root, self.elements, plan.span), plan.span)
-        return LoweredConstant(tuple(each for each, _ in placed), layout, tuple(place for _, place in placed))
+        return LoweredConstant(tuple(operation for operation, _ in placed), layout, tuple(place for _, place in placed))
 
 
 def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
@@ -220,7 +220,7 @@ def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
 
 def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Iterator[int]:
     """Yield the slot of each variable that operations of the targets use, NONE for all others."""
-    slots = [operation.slot for each in targets for operation in (*each.condition, *each.message)]
+    slots = [operation.slot for target in targets for operation in (*target.condition, *target.message)]
     for variable in variables:
         is_used = isinstance(variable, Slot) and any(variable is slot for slot in slots)
         yield variable.index if is_used else NONE

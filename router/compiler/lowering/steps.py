@@ -104,19 +104,19 @@ class _Steps:
             for _ in range(length):
                 self._field(element, None)
             return
-        each = ReadOperation(ReadKind.EACH_SEQUENCE if length is None else ReadKind.EACH, elements=length or 0)
+        loop = ReadOperation(ReadKind.EACH_SEQUENCE if length is None else ReadKind.EACH, elements=length or 0)
         if slot is not None and isinstance(element, String):
             texts = ReadOperation(ReadKind.TEXTS, slot=self.layout.number(slot))
-            self._loop(each, None, lambda steps: steps.made.append(texts))
+            self._loop(loop, None, lambda steps: steps.made.append(texts))
             self._wanted = len(self.made)
         else:
-            self._loop(each, slot, lambda steps: steps._field(element, None))
+            self._loop(loop, slot, lambda steps: steps._field(element, None))
 
-    def _loop(self, each: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
+    def _loop(self, loop: ReadOperation, slot: Slot | None, body: Callable[[_Steps], None]) -> None:
         if self.loops == MOST_LOOPS:
             message = f"this type nests more than {MOST_LOOPS} lists of messages"
             raise TooLargeError(self.span, message, "use another message type")
-        self._add(each, slot)
+        self._add(loop, slot)
         inside = _Steps(self.layout, self.span, Offset(), self.loops + 1)
         body(inside)
         inside._flush()
