@@ -121,12 +121,12 @@ class GatewayThread:
             and not service.is_closed
             and are_same(service.plan, plan)
         }
-        change = GatewayChange(kept, [], [each for each in self._services.values() if each.name not in kept])
+        change = GatewayChange(kept, [], [service for service in self._services.values() if service.name not in kept])
         try:
             for plan in program.gateways:
                 if plan.settings.name not in kept:
                     for rival in [
-                        each for each in change.unused if _exclude_each_other(each.plan.settings, plan.settings)
+                        other for other in change.unused if _exclude_each_other(other.plan.settings, plan.settings)
                     ]:
                         await rival.close()
                     service = await self._open(plan, program, outputs)
@@ -194,8 +194,8 @@ class GatewayThread:
     def clients(self, value: Callable[[ClientQueue], float]) -> Iterator[tuple[tuple[str, str], float]]:
         """Yield gateway and number of each client, and its `value`. Thread-safe."""
         for service in list(self._services.values()):
-            for each in list(service.clients.queues.values()):
-                yield (service.name, str(each.number)), value(each)
+            for queue in list(service.clients.queues.values()):
+                yield (service.name, str(queue.number)), value(queue)
 
     def stop(self) -> None:
         """Close all gateways and end the thread. If the middleware blocks it, log that and continue."""

@@ -89,16 +89,16 @@ class RouterNode:
             publications, published = open_missing(
                 self._publications, publishers, spans, partial(Publication, self._node, self._peers)
             )
-            for each in published:
-                opening.callback(each.close)
+            for publication in published:
+                opening.callback(publication.close)
             kept, subscribed = open_missing(
                 self._subscriptions, subscriptions, spans, partial(Subscription, self._node, self._peers)
             )
             opening.pop_all()
-        for each in published:
-            earlier = self._publications.get(each.plan.label)
+        for publication in published:
+            earlier = self._publications.get(publication.plan.label)
             if earlier is not None and earlier.wanted[0]:
-                each.await_subscribers()
+                publication.await_subscribers()
         for subscription in subscribed:
             if subscription.plan.label in self._subscriptions:
                 subscription.await_publishers()
@@ -147,20 +147,20 @@ class RouterNode:
     def _use(self, change: RosChange) -> None:
         self._publications, self._subscriptions = change.publications, change.subscriptions
         received, published = (
-            {each.topic: each.plan for each in endpoints.values()}
+            {endpoint.topic: endpoint.plan for endpoint in endpoints.values()}
             for endpoints in (change.subscriptions, change.publications)
         )
         self._ours = Ours(self._full_name, received, published)
         self._types.clear()
         self._types.update((topic, plan.type_name) for topic, plan in (received | published).items())
-        self.publish.update((topic, each.publish) for topic, each in change.publications.items())
-        self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
+        self.publish.update((topic, publication.publish) for topic, publication in change.publications.items())
+        self.wanted.update((topic, publication.wanted) for topic, publication in change.publications.items())
 
     def _event_thread(self) -> EventThread:
         return EventThread(
             self._node,
-            [event for each in self._publications.values() for event in each.events],
-            [event for each in self._subscriptions.values() for event in each.events],
+            [event for publication in self._publications.values() for event in publication.events],
+            [event for subscription in self._subscriptions.values() for event in subscription.events],
             self._check,
         )
 

@@ -107,8 +107,8 @@ def _mismatch(name: str, installed: Definition, compiled: Definition) -> Configu
     """Return an error with the first field that differs, and where both definitions come from."""
     package = name.partition("/")[0]
     folder = _folder(package)
-    found = msg_files().find(name)
-    file = found.file if found else "rosbags"
+    definition = msg_files().find(name)
+    file = definition.file if definition else "rosbags"
     pairs = enumerate(zip_longest(installed, compiled), 1)
     number, (there, here) = next((number, pair) for number, pair in pairs if pair[0] != pair[1])
     what = (

@@ -53,7 +53,7 @@ class BoardField:
     def is_checked(self) -> bool:
         """Whether the field, or one inside it, has limits."""
         limits = (self.longest, self.most, self.integers)
-        return bool(self.message) or self.is_float or self.is_required or any(each is not None for each in limits)
+        return bool(self.message) or self.is_float or self.is_required or any(limit is not None for limit in limits)
 
 
 BoardMessage = Mapping[int, BoardField]

@@ -100,13 +100,15 @@ _KEYS: Schema = {
     "reload": key(
         "Reload",
         "When the running router reloads its table, in addition to 'router reload' and SIGHUP.",
-        mapping({
-            "on_change": key(
-                "On change",
-                "Reload whenever a file of the table changes. If the table has errors, the old one keeps running.",
-                {**BOOLEAN, "default": False},
-            ),
-        }),
+        mapping(
+            {
+                "on_change": key(
+                    "On change",
+                    "Reload whenever a file of the table changes. If the table has errors, the old one keeps running.",
+                    {**BOOLEAN, "default": False},
+                ),
+            }
+        ),
     ),
     "networks": key(
         "Networks",
