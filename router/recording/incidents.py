@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
@@ -11,13 +11,12 @@ from router.compiler.metrics import UNSAVED_REASONS
 from router.errors import plural
 from router.log import fault, logger
 from router.recording.about import reason_of
-from router.recording.encoder import Chunk
 
 RETRY = 10_000_000_000
 """ns until the next attempt after a disk error."""
 
 MOST_UNSAVED = 64 << 20
-"""Maximum bytes of chunks that only unsaved recordings keep in memory, in addition to the last minute."""
+"""Maximum bytes of unsaved recordings in memory; but the last one is kept, whatever its size."""
 
 _REASONS = {
     errno.ENOSPC: "disk_full",
@@ -32,12 +31,15 @@ _OTHER = "disk_error"
 
 @dataclass(slots=True, eq=False)
 class Incident:
-    """A recording that the deadmen `tripped` caused. `at`: when the first one did (wall clock, ns)."""
+    """A recording that the deadmen `tripped` caused. `at`: when the first one did (wall clock, ns).
+
+    `data` is the whole file, which has this number of `datagrams`.
+    """
 
     tripped: Sequence[str]
     at: int
-    about: Mapping[str, str]
-    chunks: list[Chunk]
+    data: bytes
+    datagrams: int
 
     @property
     def reason(self) -> str:
@@ -47,15 +49,14 @@ class Incident:
 class Incidents:
     """Saves recordings of stops, oldest first, by `write`, which raises OSError. For one thread.
 
-    `in_ring` returns the chunks that are in memory anyway. `unsaved` are the numbers of waiting recordings by reason,
-    `lost` the number of lost ones, `dropped` the number of datagrams that unsaved recordings have lost.
+    `unsaved` are the numbers of waiting recordings by reason, `lost` the number of lost ones, `dropped` the number of
+    datagrams in them.
     """
 
-    def __init__(self, write: Callable[[Incident], None], in_ring: Callable[[], Sequence[Chunk]]) -> None:
+    def __init__(self, write: Callable[[Incident], None]) -> None:
         self.unsaved = dict.fromkeys(UNSAVED_REASONS, 0)
         self.lost = self.dropped = 0
         self._write = write
-        self._in_ring = in_ring
         self._waiting: list[Incident] = []
         self._retry_at: int | None = None
 
@@ -101,26 +102,15 @@ class Incidents:
         return None
 
     def _limit(self) -> None:
-        """Drop the oldest datagrams, so that those right before a stop go last."""
-        in_ring = {id(chunk) for chunk in self._in_ring()}
-        while self._size(in_ring) > MOST_UNSAVED:
-            oldest = next(chunk for incident in self._waiting for chunk in incident.chunks)
+        """Lose the oldest recordings if they need too much memory."""
+        while len(self._waiting) > 1 and sum(len(incident.data) for incident in self._waiting) > MOST_UNSAVED:
+            oldest = self._waiting.pop(0)
             self.dropped += oldest.datagrams
-            for incident in [*self._waiting]:
-                if not incident.chunks or incident.chunks[0] is not oldest:
-                    continue
-                del incident.chunks[0]
-                if not incident.chunks:
-                    self._lose(incident, "newer ones need the memory")
-                    self._waiting.remove(incident)
-
-    def _size(self, in_ring: Collection[int]) -> int:
-        kept = {id(chunk): chunk for incident in self._waiting for chunk in incident.chunks}
-        return sum(chunk.size_in_file for number, chunk in kept.items() if number not in in_ring)
+            self._lose(oldest, "newer ones need the memory")
 
     def _lose(self, incident: Incident, why: str) -> None:
         self.lost += 1
         at = datetime.fromtimestamp(incident.at / 1e9, timezone.utc).isoformat(timespec="milliseconds")
-        datagrams = plural(sum(chunk.datagrams for chunk in incident.chunks), "datagram")
+        datagrams = plural(incident.datagrams, "datagram")
         event = "the recording of a stop is lost: it could not be written"
         logger.error(event, reason=incident.reason, stopped_at=at, had=datagrams, why=why)

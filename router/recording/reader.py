@@ -128,12 +128,18 @@ class Recording:
         self.ends_early = not self.is_whole
 
     def cases(self) -> list[RecordedCase]:
-        """Return the payload cases of all channels. Chunks are skipped. Call this before reading messages."""
+        """Return the payload cases of all channels. Chunks are skipped if there is an index. Call this before reading
+        messages.
+        """
+        return self._cases(emit_chunks=True) or self._cases(emit_chunks=False)
+
+    def _cases(self, *, emit_chunks: bool) -> list[RecordedCase]:
+        """Return the payload cases of the channels outside chunks, or of all channels."""
         with self.path.open("rb") as file:
             schemas: dict[int, Schema] = {}
             found: dict[tuple[str, int], RecordedCase] = {}
             try:
-                for record in StreamReader(file, emit_chunks=True, record_size_limit=self.size).records:
+                for record in StreamReader(file, emit_chunks=emit_chunks, record_size_limit=self.size).records:
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel) and "number" in record.metadata:

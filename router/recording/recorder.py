@@ -1,13 +1,10 @@
 """The recorder: writes datagrams and actions of the mirror to disk, and keeps the newest in memory to save on request.
 
-Each datagram is encoded once when the mirror delivers it, into chunks for both; the thread `recorder` writes them.
+The thread `recorder` encodes and writes them, those in memory when they are saved.
 """
 
 from __future__ import annotations
 
-import errno
-import os
-import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,8 +12,8 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler.program import Program
@@ -24,10 +21,10 @@ from router.errors import RouterError
 from router.log import fault, logger
 from router.recording.about import about, reason_of
 from router.recording.channels import Channels
-from router.recording.encoder import LONGEST_CHUNK, Chunk, Encoder
+from router.recording.encoder import Batch, Batches, Encoder
 from router.recording.incidents import Incident, Incidents
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
-from router.recording.writer import ContinuousWriter, RecordingDirectory
+from router.recording.writer import LONGEST_CHUNK, ContinuousWriter, MessageWriter, RecordingDirectory
 from router.table.model import RecordSettings
 from router.threads import Thread, WakeEvent
 
@@ -35,7 +32,7 @@ PERIOD = 500_000_000
 """ns from chunk to chunk. A kill loses this much plus the mirror's PERIOD, or more if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""Maximum bytes of chunks in the queue to the disk."""
+"""Maximum bytes of batches in the queue to the disk."""
 
 AFTERMATH = 2_000_000_000
 """ns from a stop until its recording is saved, which then has the brakes, their effect, and further deadmen."""
@@ -55,24 +52,24 @@ class RecordError(RouterError):
 
 
 class Ring:
-    """The chunks of the last `last` ns, at most `most` bytes in total: in a flood they cover less time."""
+    """The batches of the last `last` ns, at most `most` bytes in total: in a flood they cover less time."""
 
     def __init__(self, last: int, most: int) -> None:
         self._last = last
         self._most = most
-        self._chunks: deque[Chunk] = deque()
+        self._batches: deque[Batch] = deque()
         self._size = 0
 
-    def add(self, chunk: Chunk) -> None:
-        self._chunks.append(chunk)
-        self._size += chunk.size_in_file
-        oldest = chunk.monotonic - self._last
-        while self._chunks[0].monotonic < oldest or (self._size > self._most and len(self._chunks) > 1):
-            self._size -= self._chunks.popleft().size_in_file
+    def add(self, batch: Batch) -> None:
+        self._batches.append(batch)
+        self._size += batch.size
+        oldest = batch.monotonic - self._last
+        while self._batches[0].monotonic < oldest or (self._size > self._most and len(self._batches) > 1):
+            self._size -= self._batches.popleft().size
 
-    def chunks(self) -> list[Chunk]:
-        """Return the chunks, oldest first."""
-        return list(self._chunks)
+    def batches(self) -> list[Batch]:
+        """Return the batches, oldest first."""
+        return list(self._batches)
 
 
 @dataclass(slots=True)
@@ -102,10 +99,10 @@ class Recorder:
         self._program = program()
         self._classifier = Classifier(self._program.envelope, self._program.table)
         self._channels = Channels()
-        self._encoder = Encoder(self._channels)
-        self._queue: deque[Chunk] = deque()
+        self._made = Batches()
+        self._queue: deque[Batch] = deque()
         self._queued = 0  # bytes
-        self._encoding = threading.Lock()  # for the encoder and the queue
+        self._queueing = threading.Lock()  # for both
         self._directory = RecordingDirectory(settings, self._program.table.path.stem)
         self._continuous = (
             ContinuousWriter(settings, self._directory, self._channels, lambda: self._about("continuous"))
@@ -113,8 +110,8 @@ class Recorder:
             else None
         )
         self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
-        self._incidents = Incidents(self._write_incident, lambda: self._ring.chunks() if self._ring else ())
-        self._overflow = self._lost_by_faults = 0
+        self._incidents = Incidents(self._write_incident)
+        self._overflow = 0
         self._is_writing = True
         self._due = boottime_ns() + PERIOD
         self._trips: list[_Trip] = []
@@ -174,7 +171,7 @@ class Recorder:
     def samples(self) -> Mapping[str, Sequence[tuple[tuple[str, ...], float]]]:
         """Return the metrics of the recorder: for each its label values and values."""
         continuous = self._continuous
-        write_errors = self._lost_by_faults + self._incidents.dropped + (continuous.lost if continuous else 0)
+        write_errors = self._incidents.dropped + (continuous.lost if continuous else 0)
         return {
             "recorded_datagrams": [((), continuous.datagrams if continuous else 0)],
             "recorded_bytes": [((), continuous.bytes if continuous else 0)],
@@ -200,44 +197,38 @@ class Recorder:
         with suppress(ValueError):  # it is closed
             self._wake_up.set()
 
-    def _take(self, batch: Sequence[Mirrored]) -> None:
-        """Encode a batch. Called by the mirror."""
-        self._encode(self._encoder.add, batch)
+    def _take(self, datagrams: Sequence[Mirrored]) -> None:
+        """Queue datagrams. Called by the mirror."""
+        self._put(self._made.datagrams(datagrams, self._current_classifier(), wall_ns(), boottime_ns()))
 
     def _take_actions(self, actions: Sequence[Acted]) -> None:
-        """Encode actions. Called by the mirror."""
-        self._encode(self._encoder.add_actions, actions)
+        """Queue actions. Called by the mirror."""
+        self._put(self._made.actions(actions, self._current_classifier(), wall_ns(), boottime_ns()))
 
-    def _encode(self, add: Callable[[Sequence[Any], Classifier, int, int], None], batch: Sequence[Any]) -> None:
+    def _current_classifier(self) -> Classifier:
         program = self._running_program()
         if program is not self._program:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
-        with self._encoding:
-            try:
-                add(batch, self._classifier, wall_ns(), boottime_ns())
-                if self._encoder.size > LONGEST_CHUNK:
-                    self._finish_chunk()
-            except Exception as error:  # noqa: BLE001 a fault of the router; keep recording
-                self._encoding_failed(error)
+        return self._classifier
 
-    def _finish_chunk(self) -> None:
-        """Call this with the lock `_encoding`."""
-        chunk = self._encoder.take()
-        if chunk is None:
-            return
-        if self._queued + chunk.size_in_file > MOST_QUEUED:
-            self._overflow += chunk.datagrams
-        else:
-            self._queue.append(chunk)
-            self._queued += chunk.size_in_file
+    def _put(self, batch: Batch) -> None:
+        with self._queueing:
+            if self._queued + batch.size > MOST_QUEUED:
+                self._overflow += len(batch.datagrams)
+            else:
+                self._queue.append(batch)
+                self._queued += batch.size
 
-    def _next_chunk(self) -> Chunk | None:
-        with self._encoding:
-            if not self._queue:
-                return None
-            chunk = self._queue.popleft()
-            self._queued -= chunk.size_in_file
-            return chunk
+    def _next_batches(self) -> list[Batch]:
+        """Take the batches of the next chunk from the queue."""
+        batches: list[Batch] = []
+        size = 0
+        with self._queueing:
+            while self._queue and size < LONGEST_CHUNK:
+                batches.append(self._queue.popleft())
+                size += batches[-1].size
+            self._queued -= size
+        return batches
 
     def _run(self) -> None:
         while not self._closing:
@@ -257,33 +248,24 @@ class Recorder:
         self._incidents.give_up()
 
     def _write(self) -> None:
-        """Finish a chunk, and write all queued ones."""
+        """Write all queued batches."""
         self._due = boottime_ns() + PERIOD
-        with self._encoding:
+        while batches := self._next_batches():
             try:
-                self._finish_chunk()
-            except Exception as error:  # noqa: BLE001 as in `_take`
-                self._encoding_failed(error)
-        while (chunk := self._next_chunk()) is not None:
-            try:
-                self._store(chunk)
-            except Exception as error:  # noqa: BLE001 as in `_take`
+                self._store(batches)
+            except Exception as error:  # noqa: BLE001 a fault of the router; keep recording
                 self._report(error)
             else:
                 self._is_writing = True
         if self._continuous is not None:
             self._continuous.close_if_old(boottime_ns())
 
-    def _store(self, chunk: Chunk) -> None:
+    def _store(self, batches: Sequence[Batch]) -> None:
         if self._ring is not None:
-            self._ring.add(chunk)
+            for batch in batches:
+                self._ring.add(batch)
         if self._continuous is not None:
-            self._continuous.write(chunk, boottime_ns())
-
-    def _encoding_failed(self, error: Exception) -> None:
-        """Call this with the lock `_encoding`."""
-        self._lost_by_faults += self._encoder.drop()
-        self._report(error)
+            self._continuous.write(batches, boottime_ns())
 
     def _report(self, error: Exception) -> None:
         """Log the first of several faults."""
@@ -322,20 +304,21 @@ class Recorder:
             routes = [*dict.fromkeys(trip.route for trip in trips)]
             answers = "; ".join(answer for trip in trips for answer in trip.answers)
             metadata = {**self._about(reason_of(routes), routes), **({"obeyed": answers} if answers else {})}
-            self._incidents.add(Incident(routes, trips[0].at, metadata, self._ring.chunks()))
-        except Exception as error:  # noqa: BLE001 as in `_take`
+            batches = self._ring.batches()
+            datagrams = sum(len(batch.datagrams) for batch in batches)
+            self._incidents.add(Incident(routes, trips[0].at, self._encoded(batches, metadata), datagrams))
+        except Exception as error:  # noqa: BLE001 as in `_write`
             fault(error, "prevented saving", "the recorder").log()
 
     def _write_incident(self, incident: Incident) -> None:
-        path = self._write_chunks(incident.reason, incident.chunks, incident.about, incident.at)
-        logger.info("saved the last datagrams", reason=incident.reason, file=str(path))
+        self._write_file(incident.data, incident.reason, incident.at)
 
     def _save(self, reason: str) -> Path:
         """Write the ring to a file, and return its path. Raises RecordError, which has been logged."""
         assert self._ring is not None  # noqa: S101 - `save` checks
         self._write()
         try:
-            path = self._write_chunks(reason, self._ring.chunks(), self._about(reason), wall_ns())
+            return self._write_file(self._encoded(self._ring.batches(), self._about(reason)), reason, wall_ns())
         except OSError as error:
             logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
@@ -343,27 +326,25 @@ class Recorder:
             found = fault(error, "prevented saving", "the recorder")
             found.log()
             raise RecordError(f"{found.event}: {error!r}") from error
+
+    def _encoded(self, batches: Sequence[Batch], about: Mapping[str, str]) -> bytes:
+        """Return a whole file. Meanwhile, continuous recording continues."""
+        output, encoder = BytesIO(), Encoder(self._channels)
+        file = MessageWriter(output, self._channels, about)
+        for batch in batches:
+            file.add(encoder.messages(batch))
+            if boottime_ns() >= self._due and not self._closing:
+                self._write()
+        file.finish()
+        return output.getvalue()
+
+    def _write_file(self, data: bytes, reason: str, at: int) -> Path:
+        """Write a whole file, or nothing. Raises OSError."""
+        writing = self._continuous.path if self._continuous is not None else None
+        reserve = self._settings.max_size if writing is not None else 0
+        path = self._directory.save(data, reason, at, reserve, writing)
         logger.info("saved the last datagrams", reason=reason, file=str(path))
         return path
-
-    def _write_chunks(self, reason: str, chunks: Sequence[Chunk], about: Mapping[str, str], at: int) -> Path:
-        """Write chunks to a file, all or none. Meanwhile, continuous recording continues. Raises OSError."""
-        coming = sum(chunk.size_in_file for chunk in chunks)
-        writing = self._continuous.path if self._continuous is not None else None
-        self._directory.make_room(coming + (self._settings.max_size if writing is not None else 0), writing)
-        if shutil.disk_usage(self._directory.path).free < coming:  # others need the rest
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory.path))
-        file = self._directory.new(reason, self._channels, about, at)
-        try:
-            for chunk in chunks:
-                file.write(chunk)
-                if boottime_ns() >= self._due and not self._closing:
-                    self._write()
-            file.close()
-        except Exception:
-            file.discard()
-            raise
-        return file.path
 
     def _about(self, reason: str, tripped: Sequence[str] = ()) -> dict[str, str]:
         """Return the metadata of a file."""

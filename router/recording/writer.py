@@ -1,4 +1,4 @@
-"""Writes recordings: a single MCAP file of chunks, the directory of the files, and continuous recording.
+"""Writes recordings: a single MCAP file, the directory of the files, and continuous recording.
 
 However writing ends, the written part of a file is readable.
 """
@@ -8,32 +8,21 @@ from __future__ import annotations
 import errno
 import os
 import re
-import zlib
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import IO, cast
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import (
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Statistics,
-)
-from mcap.writer import MCAP0_MAGIC
+from mcap.writer import Writer
 
 from router import __version__
 from router.clock import wall_ns
 from router.errors import ConfigurationError
 from router.log import logger
 from router.recording.channels import Channels
-from router.recording.encoder import Chunk
+from router.recording.encoder import Batch, Encoder, Message
 from router.shortage import is_shortage
 from router.table.model import RecordSettings
 
@@ -42,147 +31,145 @@ LIBRARY = "rover_router"
 METADATA = "router"
 SUFFIX = ".mcap"
 
+LONGEST_CHUNK = 4 << 20
+"""Uncompressed bytes."""
+
 _TIME = "%Y%m%dT%H%M%S.%fZ"
 _RETRY = 10_000_000_000
 """ns until the next attempt after a disk error."""
 
 
+class MessageWriter:
+    """Writes messages to `output` as MCAP, in compressed chunks. `about` is the metadata: what is recorded, and why."""
+
+    def __init__(self, output: IO[bytes], channels: Channels, about: Mapping[str, str]) -> None:
+        self._channels = channels
+        self._schemas: dict[int, int] = {}
+        self._numbers: dict[int, int] = {}  # of channels in this file
+        self._writer = Writer(output, chunk_size=LONGEST_CHUNK)
+        self._writer.start(library=f"{LIBRARY} {__version__}")
+        self._writer.add_metadata(METADATA, dict(about))
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Add messages. A channel is written with its first message."""
+        numbers, add = self._numbers, self._writer.add_message
+        for channel, log_time, data, publish_time, sequence in messages:
+            add(numbers.get(channel) or self._number(channel), log_time, data, publish_time, sequence)
+
+    def flush(self) -> None:
+        """End the chunk, and flush `output`."""
+        self._writer.flush()  # type: ignore[no-untyped-call]  # of mcap
+
+    def finish(self) -> None:
+        """Write the remaining messages and the index, and flush `output`."""
+        self._writer.finish()  # type: ignore[no-untyped-call]  # of mcap
+        self._writer.flush()  # type: ignore[no-untyped-call]  # of mcap
+
+    def _number(self, number: int) -> int:
+        channel = self._channels.channels[number]
+        if channel.schema_id not in self._schemas:
+            schema = self._channels.schemas[channel.schema_id]
+            self._schemas[schema.id] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        self._numbers[number] = self._writer.register_channel(
+            channel.topic, channel.message_encoding, self._schemas[channel.schema_id], channel.metadata
+        )
+        return self._numbers[number]
+
+
+class _Output:
+    """A new file. Keeps in memory what is written until `flush`, which writes all of it or, if it raises, nothing.
+
+    `write` and `tell` do not raise OSError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.size = 0
+        """Bytes in the file."""
+        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> None:
+        self._waiting += data
+
+    def tell(self) -> int:
+        return self.size + len(self._waiting)
+
+    def flush(self) -> None:
+        waiting, self._waiting = self._waiting, bytearray()
+        try:
+            rest = memoryview(waiting)
+            while rest:
+                rest = rest[os.write(self.descriptor, rest) :]
+        except OSError:
+            os.ftruncate(self.descriptor, self.size)
+            raise
+        self.size += len(waiting)
+
+    def sync(self) -> None:
+        """Return when the file survives a power loss."""
+        os.fdatasync(self.descriptor)
+
+    def close(self) -> None:
+        os.close(self.descriptor)
+
+
 class RecordingFile:
-    """A new recording file. All methods raise OSError. `about` is its metadata: what is recorded, and why."""
+    """A new recording file. All methods raise OSError."""
 
     def __init__(self, path: Path, channels: Channels, about: Mapping[str, str]) -> None:
         self.path = path
-        self.size = 0
-        self._channels = channels
-        self._written_schemas: set[int] = set()
-        self._indexes: list[ChunkIndex] = []
-        self._messages: Counter[int] = Counter()
-        head = MCAP0_MAGIC + _encoded([Header("", f"{LIBRARY} {__version__}")])
-        metadata = _encoded([Metadata(name=METADATA, metadata=dict(about))])
-        self._metadata = MetadataIndex(offset=len(head), length=len(metadata), name=METADATA)
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        try:
-            self._append(head + metadata)
-        except OSError:
-            os.close(self._descriptor)
-            path.unlink()
-            raise
+        self._output = _Output(path)
+        self._messages = MessageWriter(cast("IO[bytes]", self._output), channels, about)
+        self._is_open = self._is_empty = True
+        with self._closed_on_error():
+            self._output.flush()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._output.size
 
     @property
     def is_gone(self) -> bool:
         """Whether the file at its path is another one or missing: moved, removed or unmounted."""
         try:
-            return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
+            return not os.path.samestat(self.path.stat(), os.fstat(self._output.descriptor))
         except OSError:
             return True
 
-    def write(self, chunk: Chunk) -> None:
-        """Append a chunk. A partial write is truncated again."""
-        new = sorted(chunk.messages.keys() - self._messages.keys())
-        channels = [self._channels.channels[number] for number in new]
-        schemas = sorted({channel.schema_id for channel in channels} - self._written_schemas)
-        introduced = _encoded([*(self._channels.schemas[number] for number in schemas), *channels])
-        record = _encoded([chunk.record])
-        start = self.size + len(introduced)
-        offsets, position = {}, start + len(record)
-        for channel, index in chunk.indexes.items():
-            offsets[channel] = position
-            position += len(index)
-        self._append(b"".join((introduced, record, *chunk.indexes.values())))
-        self._written_schemas.update(schemas)
-        self._messages.update(chunk.messages)
-        self._indexes.append(
-            ChunkIndex(
-                chunk_length=len(record),
-                chunk_start_offset=start,
-                compression=chunk.record.compression,
-                compressed_size=len(chunk.record.data),
-                message_end_time=chunk.record.message_end_time,
-                message_index_length=sum(map(len, chunk.indexes.values())),
-                message_index_offsets=offsets,
-                message_start_time=chunk.record.message_start_time,
-                uncompressed_size=chunk.record.uncompressed_size,
-            )
-        )
+    def write(self, messages: Iterable[Message]) -> None:
+        """Append messages as a chunk, and return when it survives a power loss.
 
-    def sync(self) -> None:
-        """Return when the written data survives a power loss."""
-        os.fdatasync(self._descriptor)
+        If that fails, close the file as it was before, without an index, and remove it if it was empty.
+        """
+        with self._closed_on_error():
+            self._messages.add(messages)
+            self._messages.flush()
+            self._output.sync()
+        self._is_empty = False
 
     def close(self) -> None:
-        """Write the index and close. A file without index is readable from the start."""
+        """Write the index and close, if `write` has not. A file without an index is readable from the start."""
+        if not self._is_open:
+            return
+        self._is_open = False
         try:
-            self._append(self._end())
-            self.sync()
+            self._messages.finish()
+            self._output.sync()
         finally:
-            self._close()
+            self._output.close()
 
-    def abandon(self) -> None:
-        """Close a file after a write error; remove it if it has no chunk."""
-        with suppress(OSError):
-            if not self._indexes:
-                self.path.unlink()
-        with suppress(OSError):
-            self.close()
-
-    def discard(self) -> None:
-        """Remove a file after an error."""
-        with suppress(OSError):
-            self.path.unlink()
-        if self._descriptor >= 0:
-            self._close()
-
-    def _close(self) -> None:
-        descriptor, self._descriptor = self._descriptor, -1
-        os.close(descriptor)
-
-    def _end(self) -> bytes:
-        """Return data end, summary and footer."""
-        end = _encoded([DataEnd(0)])
-        summary = _encoded(self._summary())
-        footer = _encoded([Footer(summary_start=self.size + len(end), summary_offset_start=0, summary_crc=0)])[:-4]
-        crc = zlib.crc32(summary + footer)
-        return b"".join((end, summary, footer, crc.to_bytes(4, "little"), MCAP0_MAGIC))
-
-    def _summary(self) -> list[McapRecord]:
-        indexes = self._indexes
-        statistics = Statistics(
-            attachment_count=0,
-            channel_count=len(self._messages),
-            channel_message_counts=dict(self._messages),
-            chunk_count=len(indexes),
-            message_count=self._messages.total(),
-            message_end_time=max((index.message_end_time for index in indexes), default=0),
-            message_start_time=min((index.message_start_time for index in indexes), default=0),
-            metadata_count=1,
-            schema_count=len(self._written_schemas),
-        )
-        return [
-            *(self._channels.schemas[number] for number in sorted(self._written_schemas)),
-            *(self._channels.channels[number] for number in sorted(self._messages)),
-            statistics,
-            *indexes,
-            self._metadata,
-        ]
-
-    def _append(self, data: bytes) -> None:
+    @contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
         try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
-        except OSError:
-            os.ftruncate(self._descriptor, self.size)
-            os.lseek(self._descriptor, self.size, os.SEEK_SET)
+            yield
+        except Exception:
+            self._is_open = False
+            with suppress(OSError):
+                self._output.close()
+                if self._is_empty:
+                    self.path.unlink()
             raise
-        self.size += len(data)
-
-
-def _encoded(records: Iterable[McapRecord]) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    encoded: bytes = builder.end()  # type: ignore[no-untyped-call]  # of mcap
-    return encoded
 
 
 _DISK_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
@@ -220,14 +207,39 @@ class RecordingDirectory:
         self._stem = stem
         self._retention = settings.retention
 
-    def new(self, reason: str, channels: Channels, about: Mapping[str, str], at: int) -> RecordingFile:
+    def new(self, channels: Channels, about: Mapping[str, str], at: int) -> RecordingFile:
         """Create a file with the next number and the time `at` (wall clock, ns). Raises OSError."""
+        return RecordingFile(self._next("", at), channels, about)
+
+    def save(self, data: bytes, reason: str, at: int, reserve: int, writing: Path | None) -> Path:
+        """Write a whole file, or nothing. Return its path. Raises OSError.
+
+        Leaves room for `reserve` more bytes of the file `writing`.
+        """
+        self.make_room(len(data) + reserve, writing)
+        if shutil.disk_usage(self.path).free < len(data):  # others need the rest
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+        path = self._next(reason, at)
+        output = _Output(path)
+        try:
+            output.write(data)
+            output.flush()
+            output.sync()
+        except OSError:
+            with suppress(OSError):
+                path.unlink()
+            raise
+        finally:
+            output.close()
+        return path
+
+    def _next(self, reason: str, at: int) -> Path:
         number = 1 + max((number for number, _ in _numbered(self.path, self._stem)), default=0)
         time = datetime.fromtimestamp(at / 1e9, timezone.utc).strftime(_TIME)
         words = [self._stem, f"{number:06}", time]
         if reason:
             words.append(re.sub(r"[^a-z0-9_.-]+", "-", reason.lower()))
-        return RecordingFile(self.path / f"{'_'.join(words)}{SUFFIX}", channels, about)
+        return self.path / f"{'_'.join(words)}{SUFFIX}"
 
     def make_room(self, coming: int, writing: Path | None = None) -> None:
         """Remove the oldest files, by number, until there is room for `coming` bytes in addition to the file `writing`.
@@ -265,7 +277,7 @@ def _numbered(path: Path, stem: str) -> Iterator[tuple[int, Path]]:
 
 
 class ContinuousWriter:
-    """Writes all chunks to a series of files, and counts datagrams that the disk does not accept in `lost`.
+    """Writes all batches to a series of files, and counts datagrams that the disk does not accept in `lost`.
 
     Starts a file if there is something to write and the last one is full or old enough; calls `about` for each. Times
     are on the boot clock, in ns.
@@ -283,6 +295,7 @@ class ContinuousWriter:
         self._max_age = settings.max_age
         self._directory = directory
         self._channels = channels
+        self._encoder = Encoder(channels)
         self._about = about
         self._file: RecordingFile | None = None
         self._opened = 0
@@ -293,26 +306,27 @@ class ContinuousWriter:
         """The path of the file that is being written."""
         return self._file.path if self._file is not None else None
 
-    def write(self, chunk: Chunk, now: int) -> None:
-        """Write and sync. Disk errors are logged, not raised."""
+    def write(self, batches: Sequence[Batch], now: int) -> None:
+        """Write batches as one chunk. Disk errors are logged, not raised."""
+        datagrams = sum(len(batch.datagrams) for batch in batches)
         if self._retry_at is not None and now < self._retry_at:
-            self.lost += chunk.datagrams
+            self.lost += datagrams
             return
         try:
-            file = self._file_for(chunk, now)
-            file.write(chunk)
-            file.sync()
-        except OSError as error:
-            self._failed(error, chunk, now)
+            file = self._file_for(sum(batch.size for batch in batches), now)
+            file.write(message for batch in batches for message in self._encoder.messages(batch))
+        except Exception as error:
+            self.lost += datagrams
+            where, self._file = self.path or self._directory.path, None
+            if not isinstance(error, OSError):
+                raise
+            self._failed(error, where, now)
             return
-        except Exception:
-            self.lost += chunk.datagrams
-            raise
         if self._retry_at is not None:
             self._retry_at = None
             logger.info("recording resumed", file=str(file.path), lost=self.lost)
-        self.datagrams += chunk.datagrams
-        self.bytes += chunk.size
+        self.datagrams += datagrams
+        self.bytes += sum(batch.received for batch in batches)
 
     def close_if_old(self, now: int) -> None:
         if self._file is not None and now - self._opened >= self._max_age:
@@ -328,26 +342,21 @@ class ContinuousWriter:
             event = "the recording could not be finished and has no index; it is readable without one"
             logger.error(event, file=str(file.path), problem=error.strerror)
 
-    def _file_for(self, chunk: Chunk, now: int) -> RecordingFile:
+    def _file_for(self, size: int, now: int) -> RecordingFile:
         file = self._file
         if file is not None and file.is_gone:
             logger.warning("the recording was moved or removed; starting another", file=str(file.path))
             self.close()
-        elif file is not None and file.size + chunk.size_in_file > self._max_size:
+        elif file is not None and file.size + size > self._max_size:
             self.close()
         if self._file is None:
             self._directory.make_room(self._max_size)
-            self._file = self._directory.new("", self._channels, self._about(), wall_ns())
+            self._file = self._directory.new(self._channels, self._about(), wall_ns())
             self._opened = now
         return self._file
 
-    def _failed(self, error: OSError, chunk: Chunk, now: int) -> None:
-        self.lost += chunk.datagrams
+    def _failed(self, error: OSError, where: Path, now: int) -> None:
         if self._retry_at is None:
-            where = str(self._file.path if self._file is not None else self._directory.path)
             remedy = "free disk space, or give `record` a smaller `retention`"
-            logger.error("cannot record; retrying every 10 s", where=where, problem=error.strerror, remedy=remedy)
+            logger.error("cannot record; retrying every 10 s", where=str(where), problem=error.strerror, remedy=remedy)
         self._retry_at = now + _RETRY
-        if self._file is not None:
-            self._file.abandon()
-            self._file = None

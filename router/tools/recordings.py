@@ -13,7 +13,7 @@ from router.errors import TransportError, UsageError, did_you_mean
 from router.observe.tap import Lost
 from router.recording.about import about
 from router.recording.channels import Channels
-from router.recording.encoder import Encoder
+from router.recording.encoder import Batch, Batches, Encoder
 from router.recording.mirror import Action, Classifier, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import PERIOD
@@ -33,7 +33,9 @@ class TapRecording:
         self.path = path
         self.datagrams = self.missed = 0
         channels = Channels()
+        self._made = Batches()
         self._encoder = Encoder(channels)
+        self._waiting: list[Batch] = []
         self._classifier = Classifier(envelope, table)
         self._written_at = monotonic_ns()
         try:
@@ -63,8 +65,10 @@ class TapRecording:
             else:
                 datagrams.append(mirrored)
         self.datagrams += len(datagrams)
-        self._encoder.add(datagrams, self._classifier, time_ns(), monotonic_ns())
-        self._encoder.add_actions(actions, self._classifier, time_ns(), monotonic_ns())
+        if datagrams:
+            self._waiting.append(self._made.datagrams(datagrams, self._classifier, time_ns(), monotonic_ns()))
+        if actions:
+            self._waiting.append(self._made.actions(actions, self._classifier, time_ns(), monotonic_ns()))
         if monotonic_ns() - self._written_at >= PERIOD:
             self._write()
 
@@ -78,12 +82,11 @@ class TapRecording:
 
     def _write(self) -> None:
         self._written_at = monotonic_ns()
-        chunk = self._encoder.take()
-        if chunk is None:
+        if not self._waiting:
             return
+        waiting, self._waiting = self._waiting, []
         try:
-            self._file.write(chunk)
-            self._file.sync()
+            self._file.write(message for batch in waiting for message in self._encoder.messages(batch))
         except OSError as error:
             raise UsageError(f"cannot continue writing {self.path}: {error.strerror}") from error
 

@@ -16,7 +16,7 @@ from router.compiler.program import Program
 from router.datagrams import Peer, Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
-from router.recording.encoder import Chunk, Encoder
+from router.recording.encoder import Batch, Batches, Encoder
 from router.recording.mirror import Action, Classifier, Mirror, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import Recorder
@@ -103,32 +103,23 @@ def seen(*datagrams: bytes, at: int = START, peer: Peer = SENSOR_BOARD, reason: 
 
 def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
     """A file with one chunk per batch, with a constant clock offset."""
-    channels = Channels()
-    encoder = Encoder(channels)
-    chunks = [encoded(encoder, batch) for batch in batches]
-    return write(path, channels, *chunks, finish=finish)
+    made = Batches()
+    return write(path, Channels(), *(batched(made, batch) for batch in batches), finish=finish)
 
 
-def encoded(encoder: Encoder, batch: Sequence[MirroredDatagram]) -> Chunk:
-    """A chunk of one batch, with a constant clock offset."""
-    encoder.add(batch, classifier(), batch[-1].at, batch[-1].at - START)
-    return taken(encoder)
+def batched(made: Batches, datagrams: Sequence[MirroredDatagram]) -> Batch:
+    """A batch with a constant clock offset."""
+    return made.datagrams(datagrams, classifier(), datagrams[-1].at, datagrams[-1].at - START)
 
 
-def taken(made: Encoder) -> Chunk:
-    chunk = made.take()
-    assert chunk is not None
-    return chunk
-
-
-def write(path: Path, channels: Channels, *chunks: Chunk, finish: bool = True) -> Path:
-    file = RecordingFile(path, channels, {"reason": "test"})
-    for chunk in chunks:
-        file.write(chunk)
+def write(path: Path, channels: Channels, *batches: Batch, finish: bool = True) -> Path:
+    file, encoder = RecordingFile(path, channels, {"reason": "test"}), Encoder(channels)
+    for batch in batches:
+        file.write(encoder.messages(batch))
     if finish:
         file.close()
     else:
-        os.close(file._descriptor)
+        os.close(file._output.descriptor)
     return path
 
 

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.recording.channels import MOST_CHANNELS, Channels
-from router.recording.encoder import Encoder
+from router.recording.encoder import Batches, Encoder
 from router.types.wire import varint
 from tests.recording.recorder_rig import (
     MILLISECOND,
@@ -23,15 +23,14 @@ from tests.recording.recorder_rig import (
     START,
     STRANGER,
     again,
+    batched,
     classifier,
     datagrams,
-    encoded,
     imu,
     read,
     recorded,
     seen,
     shown,
-    taken,
     wire,
     write,
 )
@@ -69,12 +68,18 @@ def test_what_was_rejected_is_on_topics_of_its_own_by_reason(tmp_path: Path) -> 
     }
 
 
-@pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 129, 16383, MAX_DATAGRAM - 8, MAX_DATAGRAM, MAX_DATAGRAM + 1])
+@pytest.mark.parametrize(
+    "size", [0, 1, 100, 125, 127, 128, 129, 16383, MAX_DATAGRAM - 8, MAX_DATAGRAM, MAX_DATAGRAM + 1]
+)
 def test_datagrams_of_all_lengths_come_back(size: int, tmp_path: Path) -> None:
     case = wire().case("imu_info")
     payload = case.message_class.FromString(varint(2047 << 3 | 2) + varint(size) + bytes(size))
     exact = wire().encode(case, payload)
-    assert [each.data for each in read(recorded(tmp_path / "it.mcap", seen(exact)))] == [exact]
+    encoded = payload.SerializeToString()
+    too_short = varint(case.number << 3 | 2) + varint(len(encoded) - 1) + encoded
+    shown = [exact, exact + b"\0", exact[:-1], too_short]
+    found = read(recorded(tmp_path / "it.mcap", seen(*shown)))
+    assert [each.data for each in found] == shown
 
 
 def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: Path) -> None:
@@ -85,15 +90,16 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
         shown(padded, listener="exact", reason="malformed"),
     ]
     channels = Channels()
-    chunk = encoded(Encoder(channels), batch)
-    by_topic = {channels.channels[number].topic: count for number, count in chunk.messages.items()}
+    messages = Encoder(channels).messages(batched(Batches(), batch))
+    by_topic = Counter(channels.channels[message.channel].topic for message in messages)
     assert by_topic == {"raw/datagrams": 1, "imu_info": 1, "rejected/malformed/raw/datagrams": 1}
 
 
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
     many = [shown(imu(), START + n, (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1)) for n in range(MOST_CHANNELS + 10)]
-    assert encoded(Encoder(channels), many).datagrams == len(many)
+    messages = [*Encoder(channels).messages(batched(Batches(), many))]
+    assert {message.sequence for message in messages} == set(range(1, len(many) + 1))
     assert len(channels.channels) == MOST_CHANNELS + 2  # the raw datagrams, and their payloads to look at
 
 
@@ -110,25 +116,25 @@ def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many
 
 def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:
     """A rover without a battery for its clock: GPS comes up, then somebody sets it back."""
-    channels = Channels()
-    encoder = Encoder(channels)
+    made = Batches()
     walls = [0, START, START + 20 * MILLISECOND, START // 2, START // 2]
-    for number, wall in enumerate(walls):
-        encoder.add(seen(imu(), at=wall), classifier(), wall, number * 20 * MILLISECOND)
-    found = read(write(tmp_path / "it.mcap", channels, taken(encoder)))
+    batches = [
+        made.datagrams(seen(imu(), at=wall), classifier(), wall, number * 20 * MILLISECOND)
+        for number, wall in enumerate(walls)
+    ]
+    found = read(write(tmp_path / "it.mcap", Channels(), *batches))
     assert [each.at for each in found] == walls
     assert [each.steady for each in found] == [number * 20 * MILLISECOND for number in range(5)]
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**18), st.integers(0, 10**10)), min_size=2, max_size=20))
 def test_steady_times_never_go_back_and_never_run_ahead(clocks: list[tuple[int, int]]) -> None:
-    channels = Channels()
-    encoder = Encoder(channels)
+    made, batches = Batches(), []
     now = 0
     for wall, passed in clocks:
         now += passed
-        encoder.add(seen(imu(), at=wall), classifier(), wall, now)
+        batches.append(made.datagrams(seen(imu(), at=wall), classifier(), wall, now))
     with tempfile.TemporaryDirectory() as folder:
-        found = read(write(Path(folder) / "it.mcap", channels, taken(encoder)))
+        found = read(write(Path(folder) / "it.mcap", Channels(), *batches))
     assert all(first.steady <= second.steady for first, second in pairwise(found))
     assert found[-1].steady - found[0].steady <= now - clocks[0][1] + 2 * MILLISECOND

@@ -9,10 +9,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.recording import incidents as module
-from router.recording.channels import Channels
-from router.recording.encoder import Chunk, Encoder
 from router.recording.incidents import RETRY, Incident, Incidents
-from tests.recording.recorder_rig import START, encoded, imu, seen
+from tests.recording.recorder_rig import START
 
 
 class Disk:
@@ -22,8 +20,7 @@ class Disk:
         self.error: int | None = None
         self.tries = 0
         self.saved: list[Incident] = []
-        self.ring: list[Chunk] = []
-        self.incidents = Incidents(self.write, lambda: self.ring)
+        self.incidents = Incidents(self.write)
 
     def write(self, incident: Incident) -> None:
         self.tries += 1
@@ -31,13 +28,8 @@ class Disk:
             raise OSError(self.error, os.strerror(self.error))
         self.saved.append(incident)
 
-    def stop(self, route: str, *chunks: Chunk) -> None:
-        self.incidents.add(Incident([route], START, {}, [*chunks]))
-
-
-def chunks(count: int) -> list[Chunk]:
-    encoder = Encoder(Channels())
-    return [encoded(encoder, seen(imu(number), at=START + number)) for number in range(count)]
+    def stop(self, route: str, size: int = 1) -> None:
+        self.incidents.add(Incident([route], START, bytes(size), 1))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +45,7 @@ def chunks(count: int) -> list[Chunk]:
 def test_what_waits_is_counted_by_the_reason_and_tried_again_from_time_to_time(error: int, reason: str) -> None:
     disk = Disk()
     disk.error = error
-    disk.stop("drive", *chunks(1))
+    disk.stop("drive")
     disk.incidents.save(0)
     disk.incidents.save(RETRY - 1)
     assert disk.tries == 1
@@ -62,29 +54,27 @@ def test_what_waits_is_counted_by_the_reason_and_tried_again_from_time_to_time(e
     disk.incidents.save(RETRY)
     assert [each.tripped for each in disk.saved] == [["drive"]]
     assert not any(disk.incidents.unsaved.values())
-    disk.stop("arm", *chunks(1))
+    disk.stop("arm")
     disk.incidents.save(RETRY + 1)
     assert len(disk.saved) == 2
 
 
-def test_the_oldest_datagrams_go_first_and_those_in_the_ring_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_recordings_go_first_and_the_last_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_UNSAVED", 3)
     disk = Disk()
     disk.error = errno.ENOSPC
-    first, second, third, fourth = chunks(4)
-    monkeypatch.setattr(module, "MOST_UNSAVED", sum(chunk.size_in_file for chunk in (second, third, fourth)))
-    disk.stop("drive", first, second)
-    disk.stop("arm", second, third, fourth)
-    disk.ring = [fourth]
+    disk.stop("drive", 1)
+    disk.stop("arm", 2)
     disk.incidents.save(0)
-    assert disk.incidents.dropped == 0
-    disk.ring = []
-    disk.incidents.save(RETRY)
-    assert (disk.incidents.dropped, disk.incidents.lost) == (1, 0)
-    monkeypatch.setattr(module, "MOST_UNSAVED", fourth.size_in_file)
+    assert (disk.incidents.dropped, disk.incidents.lost) == (0, 0)
+    disk.stop("mast", 4)
     with capture_logs() as logs:
-        disk.incidents.save(2 * RETRY)
-    assert (disk.incidents.dropped, disk.incidents.lost, disk.incidents.unsaved["disk_full"]) == (3, 1, 1)
-    assert [(each["reason"], each["why"]) for each in logs] == [("deadman-drive", "newer ones need the memory")]
+        disk.incidents.save(RETRY)
+    assert (disk.incidents.dropped, disk.incidents.lost, disk.incidents.unsaved["disk_full"]) == (2, 2, 1)
+    assert [(each["reason"], each["why"]) for each in logs] == [
+        ("deadman-drive", "newer ones need the memory"),
+        ("deadman-arm", "newer ones need the memory"),
+    ]
     disk.error = None
-    disk.incidents.save(3 * RETRY)
-    assert [(each.tripped, each.chunks) for each in disk.saved] == [(["arm"], [fourth])]
+    disk.incidents.save(2 * RETRY)
+    assert [each.tripped for each in disk.saved] == [["mast"]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from datetime import datetime, timezone
 from functools import partial
@@ -24,12 +24,11 @@ from router.recording import incidents as incidents_module
 from router.recording import recorder as recorder_module
 from router.recording import writer as writer_module
 from router.recording.about import tripped_in
-from router.recording.channels import Channels
-from router.recording.encoder import Chunk, Encoder
+from router.recording.encoder import Batches, Encoder, Message
 from router.recording.mirror import TRIPPED, Action, MirroredDatagram
 from router.recording.reader import RecordedAction, Recording
 from router.recording.recorder import Recorder, RecordError, Ring
-from router.recording.writer import RecordingFile
+from router.recording.writer import MessageWriter
 from tests.recording.recorder_rig import (
     START,
     FakeMirror,
@@ -41,7 +40,6 @@ from tests.recording.recorder_rig import (
     seen,
     settings,
     table,
-    taken,
     wire,
 )
 
@@ -447,7 +445,7 @@ def _full(descriptor: int, data: bytes) -> int:
 
 
 def _full_after_the_head(descriptor: int, data: bytes, real: Callable[[int, bytes], int] = os.write) -> int:
-    return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
+    return real(descriptor, data[:500]) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
 
 
 @pytest.mark.parametrize("write", [_full, _full_after_the_head])
@@ -492,7 +490,9 @@ def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("owner", "name"), [(Encoder, "_append"), (Encoder, "take"), (RecordingFile, "write")], ids=str
+    ("owner", "name"),
+    [(Encoder, "messages"), (MessageWriter, "add"), (MessageWriter, "flush")],
+    ids=str,
 )
 def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
     owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -517,7 +517,7 @@ def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
     with running_recorder(tmp_path, last=10**11) as (made, mirror):
         mirror.show(batch := now(imu(1)))
         with monkeypatch.context() as faulty:
-            faulty.setattr(Recorder, "_write_chunks", _fault)
+            faulty.setattr(Recorder, "_write_file", _fault)
             with pytest.raises(RecordError, match="prevented saving; please report it: LookupError"):
                 made.save("http")
             made.deadman_tripped("drive_motor")
@@ -535,17 +535,18 @@ def test_what_comes_while_saving_takes_its_time_is_written_all_the_same(
         show(made, mirror, now(imu(1)))
         show(made, mirror, now(imu(2)))
         written: list[float] = []
-        real = RecordingFile.write
+        waiting = now(imu(3))
 
-        def slowly(file: RecordingFile, chunk: Chunk) -> None:
-            """Called by the recorder's thread."""
-            real(file, chunk)
-            if file.path.stem.endswith("_http"):
+        class Slow(MessageWriter):
+            """Used by the recorder's thread for what is saved."""
+
+            def add(self, messages: Iterable[Message]) -> None:
+                super().add(messages)
                 written.append(counted(made)["recorded_datagrams"])
-                mirror.show(now(imu(3)))
+                mirror.show(waiting)
                 sleep(0.02)
 
-        monkeypatch.setattr(RecordingFile, "write", slowly)
+        monkeypatch.setattr(recorder_module, "MessageWriter", Slow)
         made.save("http")
     assert written == [2, 3]
 
@@ -607,20 +608,17 @@ def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
 
 
 def test_a_ring_has_what_came_in_its_time() -> None:
-    ring, encoder = Ring(10, 1 << 20), Encoder(Channels())
+    ring, made = Ring(10, 1 << 20), Batches()
     for time in range(0, 30, 3):
-        encoder.add(seen(b"x"), classifier(), START, time)
-        ring.add(taken(encoder))
-    assert [each.monotonic for each in ring.chunks()] == [18, 21, 24, 27]
+        ring.add(made.datagrams(seen(b"x"), classifier(), START, time))
+    assert [each.monotonic for each in ring.batches()] == [18, 21, 24, 27]
 
 
-def test_a_ring_never_takes_more_than_it_may_but_for_the_last_chunk() -> None:
-    ring, encoder = Ring(10**9, 10_000), Encoder(Channels())
+def test_a_ring_never_takes_more_than_it_may_but_for_the_last_batch() -> None:
+    ring, made = Ring(10**9, 10_000), Batches()
     for time in range(100):
-        encoder.add(seen(os.urandom(1000)), classifier(), START, time)
-        ring.add(taken(encoder))
-        assert sum(each.size_in_file for each in ring.chunks()) <= 10_000
-    assert len(ring.chunks()) > 5
-    encoder.add(seen(*[os.urandom(16_000) for _ in range(4)]), classifier(), START, 100)
-    ring.add(taken(encoder))
-    assert len(ring.chunks()) == 1
+        ring.add(made.datagrams(seen(os.urandom(1000)), classifier(), START, time))
+        assert sum(each.size for each in ring.batches()) <= 10_000
+    assert len(ring.batches()) > 5
+    ring.add(made.datagrams(seen(*[os.urandom(16_000) for _ in range(4)]), classifier(), START, 100))
+    assert len(ring.batches()) == 1

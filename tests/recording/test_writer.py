@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from router.errors import UsageError
 from router.recording.channels import DATAGRAMS, Channels
-from router.recording.encoder import Encoder
+from router.recording.encoder import Batches, Encoder
 from router.recording.reader import Recording
 from router.recording.writer import RecordingFile
 from tests.recording.recorder_rig import (
@@ -23,7 +23,7 @@ from tests.recording.recorder_rig import (
     START,
     STRANGER,
     again,
-    encoded,
+    batched,
     imu,
     read,
     recorded,
@@ -113,20 +113,18 @@ def test_a_kill_at_any_byte_leaves_all_chunks_that_were_written_whole(finish: bo
     """At each byte around the ends of records, and at every eleventh of all others."""
     path = recorded(tmp_path / "it.mcap", *BATCHES, finish=finish)
     whole = path.read_bytes()
-    channels, ends = Channels(), [0]
-    encoder = Encoder(channels)
-    file = RecordingFile(tmp_path / "other.mcap", channels, {"reason": "test"})
-    begun = file.size
-    for batch in BATCHES:
-        chunk = encoded(encoder, batch)
-        file.write(chunk)
-        ends.append(file.size - sum(map(len, chunk.indexes.values())))  # a chunk counts without its index
+    with recorded(tmp_path / "other.mcap", *BATCHES).open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    # a chunk counts without its index
+    ends = [index.chunk_start_offset + index.chunk_length for index in summary.chunk_indexes]
+    begun = summary.chunk_indexes[0].chunk_start_offset
     cut = tmp_path / "cut.mcap"
     sizes = {begun + at for at in range(0, len(whole) - begun, 11)}
-    sizes |= {end + beside for end in (begun, *ends[1:], len(whole) - 8) for beside in range(-12, 13)}
+    sizes |= {end + beside for end in (begun, *ends, len(whole) - 8) for beside in range(-12, 13)}
     for size in sorted(size for size in sizes if begun <= size <= len(whole)):
         cut.write_bytes(whole[:size])
-        expected = [each for batch, end in zip(BATCHES, ends[1:], strict=True) if end <= size for each in batch]
+        expected = [each for batch, end in zip(BATCHES, ends, strict=True) if end <= size for each in batch]
         recording = Recording(cut)
         assert [again(each) for each in recording.datagrams()] == expected
         assert recording.is_whole == (finish and size >= len(whole) - 8)
@@ -240,11 +238,9 @@ def test_a_recording_that_another_tool_rewrote_is_read_like_the_first(
 
 
 def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    channels = Channels()
-    file = RecordingFile(tmp_path / "it.mcap", channels, {})
-    encoder = Encoder(channels)
-    first = encoded(encoder, BATCHES[0])
-    file.write(first)
+    channels, made = Channels(), Batches()
+    file, encoder = RecordingFile(tmp_path / "it.mcap", channels, {}), Encoder(channels)
+    file.write(encoder.messages(batched(made, BATCHES[0])))
     size, real = file.size, os.write
 
     def full(descriptor: int, data: bytes) -> int:
@@ -252,21 +248,19 @@ def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch
             raise OSError(28, "No space left on device")
         return real(descriptor, data[:40])
 
-    monkeypatch.setattr(os, "write", full)
-    with pytest.raises(OSError, match="No space"):
-        file.write(first)
+    with monkeypatch.context() as failing:
+        failing.setattr(os, "write", full)
+        with pytest.raises(OSError, match="No space"):
+            file.write(encoder.messages(batched(made, BATCHES[1])))
     assert file.size == size == (tmp_path / "it.mcap").stat().st_size
-    monkeypatch.undo()
-    file.write(encoded(encoder, BATCHES[2]))
     file.close()
-    assert [again(each) for each in read(tmp_path / "it.mcap")] == [*BATCHES[0], *BATCHES[2]]
+    assert [again(each) for each in read(tmp_path / "it.mcap")] == BATCHES[0]
 
 
 def test_channels_are_written_only_into_files_that_use_them(tmp_path: Path) -> None:
-    channels = Channels()
-    encoder = Encoder(channels)
+    channels, made = Channels(), Batches()
     for name, batch in (("first.mcap", BATCHES[0]), ("second.mcap", BATCHES[2])):
-        write(tmp_path / name, channels, encoded(encoder, batch))
+        write(tmp_path / name, channels, batched(made, batch))
     with (tmp_path / "second.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
