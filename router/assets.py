@@ -32,7 +32,7 @@ def page_policy(page: bytes) -> str:
     """Return the Content-Security-Policy of a page with inline scripts and styles only. Callers add connect-src."""
     import base64
     import re
-    from hashlib import sha256  # not at the top: `table` is the first to import it, without OpenSSL
+    from hashlib import sha256
 
     sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
     for kind, text in re.findall(rb"<(script|style)[^>]*>(.*?)</\1>", page, re.DOTALL):

@@ -78,15 +78,15 @@ logger: FilteringBoundLogger = LazyLogger("router")
 
 
 def _import_structlog() -> ModuleType:
-    """Import structlog without rich and asyncio, which serve tracebacks and methods that are not used here."""
+    """Import structlog without asyncio, which serves methods that are not used here."""
     import logging
 
-    from router.lean import left_out, postponed
+    from router.lazy_import import lazy_import
 
     # structlog makes a log record. From Python 3.12 on, a record looks for the current task in sys.modules["asyncio"],
     # and the stand-in there would import asyncio.
     logging.logAsyncioTasks = False  # type: ignore[attr-defined]  # of Python 3.12
-    with left_out("rich"), postponed("asyncio"):
+    with lazy_import("asyncio"):
         import structlog
     return structlog
 

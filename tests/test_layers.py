@@ -10,8 +10,8 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors shortage inputs assets lean clock log threads"
-LANGUAGE = "declared errors shortage inputs assets lean library table types compiler"
+GROUND = "declared errors shortage inputs assets lazy_import clock log threads"
+LANGUAGE = "declared errors shortage inputs assets lazy_import library table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
@@ -19,14 +19,14 @@ IMPORTS = {
     "inputs": "errors shortage",
     "assets": "",
     "clock": "",
-    "lean": "",
+    "lazy_import": "",
     "library": "declared errors shortage assets",
-    "log": "clock errors lean shortage",
+    "log": "clock errors lazy_import shortage",
     "threads": "clock log shortage",
-    "table": "errors inputs assets lean",
-    "types": "declared errors inputs assets lean",
+    "table": "errors inputs assets lazy_import",
+    "types": "declared errors inputs assets lazy_import",
     "values": "errors types",
-    "compiler": "declared errors inputs assets lean library table types",
+    "compiler": "declared errors inputs assets lazy_import library table types",
     "datagrams": "declared errors table types",
     "image": LANGUAGE,
     "net": f"{GROUND} {LANGUAGE} datagrams",
@@ -44,7 +44,7 @@ IMPORTS = {
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"declared", "errors", "lean", "library", "table", "types", "values", "compiler", "datagrams", "image"}
+PURE = {"declared", "errors", "lazy_import", "library", "table", "types", "values", "compiler", "datagrams", "image"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -14,9 +14,9 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from router.errors import ConfigurationError, StartError
+from router.lazy_import import lazy_import
 from router.log import logger
 from router.ros.environment import unresolved_peers
-from router.ros.types import lean_interfaces
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
 """The errors of rclpy for invalid arguments, names and settings; its own errors derive from RuntimeError."""
@@ -37,7 +37,7 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
             # parameters set the table's variables at start, and setting them later would have no effect. It has no
             # type description service: rclpy's executor would answer it, and none runs.
             context.init(list(ros_args), initialize_logging=False)
-            with lean_interfaces():
+            with lazy_import("numpy"):  # for fields of fixed length, which CDR bytes do not need
                 node = Node(
                     name,
                     namespace=namespace,

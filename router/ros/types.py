@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib.machinery import PathFinder
 from itertools import zip_longest
 from pathlib import Path
@@ -24,7 +23,7 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 
 from router.assets import asset
 from router.errors import ConfigurationError, SourceSpan, StartError, shown_path
-from router.lean import left_out, postponed
+from router.lazy_import import lazy_import
 from router.ros.environment import ros_package_remedy
 from router.ros.type_support import Definition, class_for_cdr, library_of
 from router.shortage import is_shortage
@@ -40,16 +39,6 @@ _BASIC: dict[str, Type] = {
     "double": Float(64),
     **{str(it): it for it in (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (False, True))},
 }
-
-
-@contextmanager
-def lean_interfaces() -> Iterator[None]:
-    """Within the context, import modules of message types without imports that CDR bytes do not need.
-
-    These are numpy, for fields of fixed length, and the generator of such modules, with its parsers.
-    """
-    with postponed("numpy"), left_out("rosidl_generator_py.generate_py_impl"):
-        yield
 
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
@@ -68,7 +57,7 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
     package, kind, short = _parts(name)
     message_class = None
     if _has_part(package, kind):
-        with lean_interfaces():
+        with lazy_import("numpy"):
             message_class = class_for_cdr(package, kind, short, definitions)
         if message_class is not None and _other_library(package, message_class) is None:
             return message_class
@@ -131,7 +120,7 @@ def loaded_class(name: str) -> Any:
     """Like `installed_class`, with the type support loaded, which takes some 10 ms. Raises StartError."""
     message_class = installed_class(name)
     try:
-        with lean_interfaces():
+        with lazy_import("numpy"):
             check_is_valid_msg_type(message_class)
     except Exception as error:  # a library that cannot be loaded, or anything else
         why = f"{error}: {error.__context__}" if error.__context__ else str(error)  # the latter names the library
@@ -151,7 +140,7 @@ def installed_class(name: str) -> Any:
             f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name)
         )
     try:
-        with lean_interfaces():
+        with lazy_import("numpy"):
             message_class = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
         raise _kind(error)(f"{name} cannot be loaded: {error}") from error

@@ -10,6 +10,7 @@ import enum
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from hashlib import sha256
 from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any, TypeVar, Union
@@ -17,7 +18,6 @@ from typing import Any, TypeVar, Union
 from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
-from router.lean import left_out
 from router.table.addresses import LOCAL, REMOTE, Address
 from router.table.keys import Key, keys_of
 from router.table.model import (
@@ -83,9 +83,6 @@ from router.table.reading import (
 )
 from router.table.source import Source
 from router.table.units import TOPIC_RATE
-
-with left_out("_hashlib"):  # OpenSSL costs 4 MB and 8 ms; Python's own implementation is enough
-    from hashlib import sha256
 
 T = TypeVar("T")
 M = TypeVar("M")

@@ -10,15 +10,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from hashlib import sha256
 from pathlib import Path, PurePosixPath
 
 from router import inputs
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
-from router.lean import left_out
 from router.types.lock_file import Lock
-
-with left_out("_hashlib"):  # OpenSSL costs 4 MB and 8 ms; Python's own implementation is enough
-    from hashlib import sha256
 
 PROTO = ".proto"
 OPTIONS = ".options"

@@ -67,8 +67,8 @@ GATEWAY = """\
 gateways:
   page: {transport: {websocket: "127.0.0.1:PORT"}}
 """
-UNUSED_BY_TOPICS = ("numpy", "lark", "em", "sensor_msgs.msg", "rich", "asyncio", "ssl", "_hashlib")
-UNUSED_BY_GATEWAYS = ("numpy", "lark", "em", "sensor_msgs.msg", "rich")
+UNUSED_BY_TOPICS = ("numpy", "sensor_msgs.msg", "asyncio", "ssl")
+UNUSED_BY_GATEWAYS = ("numpy", "sensor_msgs.msg")
 """Large modules that libraries would import."""
 
 

@@ -1,4 +1,4 @@
-"""Postponed and suppressed imports."""
+"""Delayed imports."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from router.lean import left_out, postponed
+from router.lazy_import import lazy_import
 
 
 @pytest.fixture(autouse=True)
@@ -22,15 +22,15 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_module_is_imported_when_it_is_first_used() -> None:
-    with postponed("large"):
+    with lazy_import("large"):
         user = importlib.import_module("user")
     assert "large" not in sys.modules
     assert user.size() == 7
     assert sys.modules["large"].SIZE == 7
 
 
-def test_it_can_be_used_while_imports_are_postponed() -> None:
-    with postponed("large"):
+def test_it_can_be_used_while_its_import_is_delayed() -> None:
+    with lazy_import("large"):
         assert importlib.import_module("user").size() == 7
         real = sys.modules["large"]
         assert "SIZE" in vars(real)
@@ -38,26 +38,20 @@ def test_it_can_be_used_while_imports_are_postponed() -> None:
 
 
 def test_others_get_the_module_itself() -> None:
-    with postponed("large"):
+    with lazy_import("large"):
         importlib.import_module("user")
     assert vars(importlib.import_module("large"))["SIZE"] == 7
 
 
 def test_what_is_missing_says_so_when_it_is_used() -> None:
-    with postponed("larger"):
+    with lazy_import("larger"):
         larger = importlib.import_module("larger")
     with pytest.raises(ModuleNotFoundError, match="larger"):
         _ = larger.SIZE
 
 
-def test_a_module_that_is_left_out_cannot_be_imported_until_later() -> None:
-    with left_out("large"), pytest.raises(ImportError, match="large"):
-        importlib.import_module("user")
-    assert importlib.import_module("user").size() == 7
-
-
 def test_what_has_been_imported_stays() -> None:
     large = importlib.import_module("large")
-    with postponed("large"), left_out("large"):
+    with lazy_import("large"):
         assert importlib.import_module("large") is large
     assert sys.modules["large"] is large
