@@ -21,7 +21,7 @@ from router.carrier.events import DeadmanEvents, EventReader, EventThread
 from router.carrier.forwarding import FIRST_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.loading import LoadedImage
-from router.carrier.mirror import ActionRing, MirrorRing
+from router.carrier.mirror import ActionRing, MirrorRing, Taken
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.carrier.ros_routes import RosRoutes
@@ -268,11 +268,11 @@ class Plane:
         lost = self.counts.counters.index("mirror_dropped") if is_observed else None
         self._forwarding.mirror(lost, self._client_deadmen.group)
 
-    def take(self) -> list[tuple[int, str, Peer, str, str, bytes]]:
+    def take(self) -> Taken[tuple[int, str, Peer, str, str, bytes]]:
         """Return the datagrams received since the last call, as `recording.mirror.Mirrored`. Not thread-safe."""
         return self._mirrored.take()
 
-    def take_actions(self) -> list[tuple[int, str, str, str, str, str, str, bytes]]:
+    def take_actions(self) -> Taken[tuple[int, str, str, str, str, str, str, bytes]]:
         """Return the actions since the last call, as fields of `recording.mirror.Action`. Not thread-safe."""
         return self._acted.take()
 

@@ -25,7 +25,7 @@ MOST_COUNTERS = 1 << 18
 FIRST_GENERATION = 1
 """The generation of a stored image; compiled ones have higher generations."""
 
-_PUBLISHED, _MIRRORED, _ACTIONS, _EVENTS = 1 << 20, 1 << 22, 1 << 18, 1 << 18
+_PUBLISHED, _MIRRORED, _ACTIONS, _EVENTS = 1 << 20, 1 << 22, 1 << 20, 1 << 18
 """Bytes of the queues: messages for topics, received datagrams and actions for observers, and events of a thread."""
 
 

@@ -60,6 +60,10 @@ class Incidents:
         self._waiting: list[Incident] = []
         self._retry_at: int | None = None
 
+    @property
+    def is_waiting(self) -> bool:
+        return bool(self._waiting)
+
     def add(self, incident: Incident) -> None:
         """Add a recording; it is saved by the next call of `save`."""
         self._waiting.append(incident)

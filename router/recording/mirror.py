@@ -6,8 +6,10 @@ While no consumer is attached, the native threads do nothing for it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Container, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
@@ -16,13 +18,16 @@ from router.compiler.network import recognisers
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.table.model import Framing, RouteTable
-from router.threads import Thread, join_or_abandon
+from router.threads import Thread, WakeEvent, join_or_abandon
 from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import I32, I32_SIZE, I64, I64_SIZE, LEN, VARINT, read_varint, varint
 
-PERIOD = 0.05
-"""Seconds between two batches: waking consumers for each datagram would cost more than routing it."""
+PERIOD = 50_000_000
+"""ns between two batches: waking consumers for each datagram would cost more than routing it."""
+
+KEEPING_PERIOD = 250_000_000
+"""Likewise, while there are only keepers."""
 
 
 class MirroredDatagram(NamedTuple):
@@ -81,16 +86,37 @@ Consumer = Callable[[Sequence[Mirrored]], None]
 ActionConsumer = Callable[[Sequence[Acted]], None]
 
 
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Taken(Protocol[T_co]):
+    """Datagrams or actions as `records`, which `decode` decodes whenever they are read."""
+
+    @property
+    def records(self) -> bytes: ...
+
+    @property
+    def decode(self) -> Callable[[bytes], Iterator[T_co]]: ...
+
+    def __len__(self) -> int:
+        """Return their number, which takes time."""
+
+    def __iter__(self) -> Iterator[T_co]: ...
+
+
+Keeper = Callable[[Taken[Mirrored], Taken[Acted]], None]
+
+
 class Source(Protocol):
     """A source of mirrored datagrams."""
 
     def observe(self, *, is_observed: bool) -> None:
         """Called when the first consumer has attached, and when the last one has detached."""
 
-    def take(self) -> Sequence[Mirrored]:
+    def take(self) -> Taken[Mirrored]:
         """Return the datagrams since the last call."""
 
-    def take_actions(self) -> Sequence[Acted]:
+    def take_actions(self) -> Taken[Acted]:
         """Return the actions since the last call."""
 
     @property
@@ -98,20 +124,28 @@ class Source(Protocol):
         """Datagrams and actions that were not mirrored."""
 
 
-class Mirror:
-    """Calls the consumers, one call at a time, at most PERIOD after a datagram or an action; they must return quickly.
+@dataclass(frozen=True, eq=False)
+class _Observer:
+    """Has a consumer, and perhaps one of actions, or a keeper."""
 
-    Exceptions of consumers go to `failed`.
+    consumer: Consumer | None = None
+    acted: ActionConsumer | None = None
+    keeper: Keeper | None = None
+
+
+class Mirror:
+    """Calls the observers, one call at a time, soon after a datagram or an action; they must return quickly.
+
+    Exceptions of observers go to `failed`.
     """
 
     def __init__(self, source: Source, failed: Callable[[Exception], None]) -> None:
         self._source = source
         self._failed = failed
-        self._consumers: tuple[tuple[Consumer, ActionConsumer | None], ...] = ()
+        self._observers: tuple[_Observer, ...] = ()
         self._attaching = threading.Lock()
         self._delivering = threading.Lock()
-        self._stopping = threading.Event()
-        self._thread: Thread | None = None
+        self._thread: _Delivery | None = None
 
     @property
     def lost(self) -> int:
@@ -120,33 +154,36 @@ class Mirror:
 
     @property
     def is_observed(self) -> bool:
-        """Whether a consumer is attached."""
-        return bool(self._consumers)
+        """Whether an observer is attached."""
+        return bool(self._observers)
 
     def attach(self, consumer: Consumer, acted: ActionConsumer | None = None) -> Callable[[], None]:
         """Call `consumer` with all datagrams from now on, and `acted` with all actions. Returns a function to detach.
 
         A consumer must not detach itself. A call in progress when it is detached still finishes.
         """
+        return self._attach(_Observer(consumer, acted))
+
+    def keep(self, keeper: Keeper) -> Callable[[], None]:
+        """Like `attach`, but call `keeper` with datagrams and actions that are not decoded, at a lower cost."""
+        return self._attach(_Observer(keeper=keeper))
+
+    def _attach(self, attached: _Observer) -> Callable[[], None]:
         with self._attaching:
-            if not self._consumers:
-                stopping = threading.Event()
-                thread = Thread(self._run, "mirror", (stopping,))
-                thread.start()
-                self._stopping, self._thread = stopping, thread
-            attached = consumer, acted
-            self._consumers = (*self._consumers, attached)
-            if len(self._consumers) == 1:
+            if not self._observers:
+                self._thread = _Delivery(self)
+            self._observers = (*self._observers, attached)
+            if len(self._observers) == 1:
                 self._source.observe(is_observed=True)
 
         def detach() -> None:
             with self._attaching:
-                if not any(each is attached for each in self._consumers):
+                if not any(each is attached for each in self._observers):
                     return
-                if len(self._consumers) == 1:
+                if len(self._observers) == 1:
                     self._end()
-                self._consumers = tuple(each for each in self._consumers if each is not attached)
-                if not self._consumers:
+                self._observers = tuple(each for each in self._observers if each is not attached)
+                if not self._observers:
                     self._source.observe(is_observed=False)
                     self._source.take()
                     self._source.take_actions()
@@ -156,39 +193,72 @@ class Mirror:
     def close(self) -> None:
         """Deliver waiting datagrams, and end the thread. Call this when nothing is received any more."""
         with self._attaching:
-            if self._consumers:
+            if self._observers:
                 self._end()
 
     def _end(self) -> None:
-        assert self._thread is not None  # noqa: S101 - there is one while there are consumers
-        self._stopping.set()
-        if join_or_abandon(self._thread):
+        assert self._thread is not None  # noqa: S101 - there is one while there are observers
+        if self._thread.end():
             self.deliver()
 
-    def _run(self, stopping: threading.Event) -> None:
-        while not stopping.wait(PERIOD):
-            self.deliver()
+    @property
+    def period(self) -> int:
+        """Time between two batches, ns."""
+        return PERIOD if self._has_consumers() else KEEPING_PERIOD
+
+    def _has_consumers(self) -> bool:
+        return any(observer.consumer is not None for observer in self._observers)
 
     def deliver(self, patience: float = -1) -> bool:
-        """Call the consumers with what was mirrored until now. Thread-safe.
+        """Call the observers with what was mirrored until now. Thread-safe.
 
         Return False if another delivery takes longer than `patience` (s, or -1 for any time).
         """
         if not self._delivering.acquire(timeout=patience):
             return False
         try:
-            actions, batch = self._source.take_actions(), self._source.take()
-            for consumer, acted in self._consumers:
+            actions, datagrams = self._source.take_actions(), self._source.take()
+            is_read = self._has_consumers()
+            acted, batch = ([*actions], [*datagrams]) if is_read else ([], [])
+            for observer in self._observers:
                 try:
-                    if batch:
-                        consumer(batch)
-                    if actions and acted is not None:
-                        acted(actions)
-                except Exception as error:  # noqa: BLE001 a fault of the router, reported; other consumers continue
+                    if observer.keeper is not None:
+                        observer.keeper(datagrams, actions)
+                    if batch and observer.consumer is not None:
+                        observer.consumer(batch)
+                    if acted and observer.acted is not None:
+                        observer.acted(acted)
+                except Exception as error:  # noqa: BLE001 a fault of the router, reported; other observers continue
                     self._failed(error)
         finally:
             self._delivering.release()
         return True
+
+
+class _Delivery:
+    """The thread of a mirror, which runs until `end`."""
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._mirror = mirror
+        self._is_ending = False
+        self._wake_up = WakeEvent()
+        self._thread = Thread(self._run, "mirror")
+        self._thread.start()
+
+    def end(self) -> bool:
+        """Return whether the thread has ended; else an observer hangs. Idempotent."""
+        self._is_ending = True
+        with suppress(ValueError):  # it has ended
+            self._wake_up.set()
+        return join_or_abandon(self._thread)
+
+    def _run(self) -> None:
+        while True:
+            self._wake_up.wait(self._mirror.period)
+            if self._is_ending:
+                self._wake_up.close()
+                return
+            self._mirror.deliver()
 
 
 class Classifier:

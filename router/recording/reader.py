@@ -111,7 +111,7 @@ class Recording:
     def everything(self) -> Iterator[Recorded | RecordedAction]:
         """Yield each datagram and each action once, until the end of the file or damage.
 
-        Actions are about 0.1 s out of order.
+        Actions are up to 0.3 s out of order.
         """
         try:
             for record in self._records:

@@ -21,18 +21,18 @@ from router.errors import RouterError
 from router.log import fault, logger
 from router.recording.about import about, reason_of
 from router.recording.channels import Channels
-from router.recording.encoder import Batch, Batches, Encoder
+from router.recording.encoder import Batch, Encoder, Packer
 from router.recording.incidents import Incident, Incidents
-from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
+from router.recording.mirror import Acted, Classifier, Mirror, Mirrored, Taken
 from router.recording.writer import LONGEST_CHUNK, ContinuousWriter, MessageWriter, RecordingDirectory
 from router.table.model import RecordSettings
 from router.threads import Thread, WakeEvent
 
 PERIOD = 500_000_000
-"""ns from chunk to chunk. A kill loses this much plus the mirror's PERIOD, or more if the disk is slow."""
+"""ns from chunk to chunk. A kill loses this much, or more if the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""Maximum bytes of batches in the queue to the disk."""
+"""Maximum bytes of batches in the queue to the disk. Those in memory for `last` are not in it."""
 
 AFTERMATH = 2_000_000_000
 """ns from a stop until its recording is saved, which then has the brakes, their effect, and further deadmen."""
@@ -43,8 +43,14 @@ LONGEST_AFTERMATH = 10_000_000_000
 STOP_SECONDS = 2.5
 """How long shutting down waits for the disk. A service manager kills the router after 10 s, and more must be closed."""
 
-_PATIENCE = 30.0
-"""Timeout of `save`, s."""
+MOST_AT_STOP = 2 << 20
+"""Maximum bytes of batches that are saved while shutting down: 100,000 datagrams, which take up to 2 s."""
+
+_PATIENCE, _MOMENT = 30.0, 1.0
+"""Timeouts, s: of `save`, and of having the mirror deliver what led to a stop."""
+
+_FOREVER = 2**62
+"""ns."""
 
 
 class RecordError(RouterError):
@@ -67,9 +73,13 @@ class Ring:
         while self._batches[0].monotonic < oldest or (self._size > self._most and len(self._batches) > 1):
             self._size -= self._batches.popleft().size
 
-    def batches(self) -> list[Batch]:
-        """Return the batches, oldest first."""
-        return list(self._batches)
+    def batches(self, most: int | None = None) -> list[Batch]:
+        """Return the batches, oldest first; only the newest ones if they have more than `most` bytes."""
+        batches = list(self._batches)
+        size = self._size
+        while most is not None and size > most and len(batches) > 1:
+            size -= batches.pop(0).size
+        return batches
 
 
 @dataclass(slots=True)
@@ -99,10 +109,10 @@ class Recorder:
         self._program = program()
         self._classifier = Classifier(self._program.envelope, self._program.table)
         self._channels = Channels()
-        self._made = Batches()
-        self._queue: deque[Batch] = deque()
+        self._packer = Packer()
+        self._queue: deque[Batch] = deque()  # for continuous recording
         self._queued = 0  # bytes
-        self._queueing = threading.Lock()  # for both
+        self._taking = threading.Lock()  # for both, and the ring
         self._directory = RecordingDirectory(settings, self._program.table.path.stem)
         self._continuous = (
             ContinuousWriter(settings, self._directory, self._channels, lambda: self._about("continuous"))
@@ -123,7 +133,7 @@ class Recorder:
         self._wake_up = WakeEvent()
         self._thread = Thread(self._run, "recorder")  # a disk may hang
         self._thread.start()
-        self._detach = mirror.attach(self._take, self._take_actions)
+        self._detach = mirror.keep(self._take)
 
     def save(self, reason: str) -> Path:
         """Write all datagrams until now that are in memory to a new file, and return its path. Thread-safe.
@@ -143,7 +153,7 @@ class Recorder:
         try:
             return done.result(_PATIENCE)
         except NotInTime:
-            raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
+            raise RecordError(f"saving takes longer than {_PATIENCE:.0f} s") from None
 
     def deadman_tripped(self, route: str, awaited: Iterable[str] = ()) -> None:
         """Request to save what is in memory after AFTERMATH and the answers of `awaited` boards. Returns at once."""
@@ -197,24 +207,21 @@ class Recorder:
         with suppress(ValueError):  # it is closed
             self._wake_up.set()
 
-    def _take(self, datagrams: Sequence[Mirrored]) -> None:
-        """Queue datagrams. Called by the mirror."""
-        self._put(self._made.datagrams(datagrams, self._current_classifier(), wall_ns(), boottime_ns()))
-
-    def _take_actions(self, actions: Sequence[Acted]) -> None:
-        """Queue actions. Called by the mirror."""
-        self._put(self._made.actions(actions, self._current_classifier(), wall_ns(), boottime_ns()))
-
-    def _current_classifier(self) -> Classifier:
+    def _take(self, datagrams: Taken[Mirrored], actions: Taken[Acted]) -> None:
+        """Queue what the mirror has taken. Called by the mirror."""
+        if not datagrams.records and not actions.records:
+            return
         program = self._running_program()
         if program is not self._program:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
-        return self._classifier
-
-    def _put(self, batch: Batch) -> None:
-        with self._queueing:
+        batch = self._packer.pack(datagrams, actions, self._classifier, wall_ns(), boottime_ns())
+        with self._taking:
+            if self._ring is not None:
+                self._ring.add(batch)
+            if self._continuous is None:
+                return
             if self._queued + batch.size > MOST_QUEUED:
-                self._overflow += len(batch.datagrams)
+                self._overflow += batch.count()
             else:
                 self._queue.append(batch)
                 self._queued += batch.size
@@ -223,7 +230,7 @@ class Recorder:
         """Take the batches of the next chunk from the queue."""
         batches: list[Batch] = []
         size = 0
-        with self._queueing:
+        with self._taking:
             while self._queue and size < LONGEST_CHUNK:
                 batches.append(self._queue.popleft())
                 size += batches[-1].size
@@ -232,7 +239,9 @@ class Recorder:
 
     def _run(self) -> None:
         while not self._closing:
-            self._wake_up.wait(self._due - boottime_ns())
+            self._wake_up.wait(self._due - boottime_ns() if self._has_to_look() else _FOREVER)
+            if self._continuous is not None:
+                self._mirror.deliver(0)  # it does so less often
             self._write()
             self._save_requested()
             if self._trips and self._are_trips_due():
@@ -247,25 +256,23 @@ class Recorder:
         self._incidents.save(boottime_ns(), at_once=True)
         self._incidents.give_up()
 
+    def _has_to_look(self) -> bool:
+        """Return whether something may be due without a wake-up."""
+        return self._continuous is not None or bool(self._trips) or self._incidents.is_waiting
+
     def _write(self) -> None:
         """Write all queued batches."""
         self._due = boottime_ns() + PERIOD
+        if self._continuous is None:
+            return
         while batches := self._next_batches():
             try:
-                self._store(batches)
+                self._continuous.write(batches, boottime_ns())
             except Exception as error:  # noqa: BLE001 a fault of the router; keep recording
                 self._report(error)
             else:
                 self._is_writing = True
-        if self._continuous is not None:
-            self._continuous.close_if_old(boottime_ns())
-
-    def _store(self, batches: Sequence[Batch]) -> None:
-        if self._ring is not None:
-            for batch in batches:
-                self._ring.add(batch)
-        if self._continuous is not None:
-            self._continuous.write(batches, boottime_ns())
+        self._continuous.close_if_old(boottime_ns())
 
     def _report(self, error: Exception) -> None:
         """Log the first of several faults."""
@@ -299,14 +306,14 @@ class Recorder:
         assert self._ring is not None  # noqa: S101 - `deadman_tripped` checks
         with self._tripping:
             trips, self._trips = self._trips, []
+        self._mirror.deliver(_MOMENT)
         self._write()
         try:
             routes = [*dict.fromkeys(trip.route for trip in trips)]
             answers = "; ".join(answer for trip in trips for answer in trip.answers)
             metadata = {**self._about(reason_of(routes), routes), **({"obeyed": answers} if answers else {})}
-            batches = self._ring.batches()
-            datagrams = sum(len(batch.datagrams) for batch in batches)
-            self._incidents.add(Incident(routes, trips[0].at, self._encoded(batches, metadata), datagrams))
+            data, datagrams = self._encoded(metadata)
+            self._incidents.add(Incident(routes, trips[0].at, data, datagrams))
         except Exception as error:  # noqa: BLE001 as in `_write`
             fault(error, "prevented saving", "the recorder").log()
 
@@ -318,7 +325,7 @@ class Recorder:
         assert self._ring is not None  # noqa: S101 - `save` checks
         self._write()
         try:
-            return self._write_file(self._encoded(self._ring.batches(), self._about(reason)), reason, wall_ns())
+            return self._write_file(self._encoded(self._about(reason))[0], reason, wall_ns())
         except OSError as error:
             logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
@@ -327,16 +334,26 @@ class Recorder:
             found.log()
             raise RecordError(f"{found.event}: {error!r}") from error
 
-    def _encoded(self, batches: Sequence[Batch], about: Mapping[str, str]) -> bytes:
-        """Return a whole file. Meanwhile, continuous recording continues."""
+    def _encoded(self, about: Mapping[str, str]) -> tuple[bytes, int]:
+        """Return a whole file of what is in memory, and the number of its datagrams.
+
+        Meanwhile, continuous recording continues.
+        """
+        assert self._ring is not None  # noqa: S101 - callers check
         output, encoder = BytesIO(), Encoder(self._channels)
         file = MessageWriter(output, self._channels, about)
-        for batch in batches:
+        with self._taking:
+            batches = self._ring.batches()
+            newest = self._ring.batches(MOST_AT_STOP) if self._closing else batches
+        if len(newest) < len(batches):
+            lost = f"{(newest[0].monotonic - batches[0].monotonic) / 1e9:.1f} s"
+            logger.warning("the router stops, so it saves only the newest datagrams", left_out=lost)
+        for batch in newest:
             file.add(encoder.messages(batch))
             if boottime_ns() >= self._due and not self._closing:
                 self._write()
         file.finish()
-        return output.getvalue()
+        return output.getvalue(), encoder.datagrams
 
     def _write_file(self, data: bytes, reason: str, at: int) -> Path:
         """Write a whole file, or nothing. Raises OSError."""

@@ -308,15 +308,15 @@ class ContinuousWriter:
 
     def write(self, batches: Sequence[Batch], now: int) -> None:
         """Write batches as one chunk. Disk errors are logged, not raised."""
-        datagrams = sum(len(batch.datagrams) for batch in batches)
         if self._retry_at is not None and now < self._retry_at:
-            self.lost += datagrams
+            self.lost += sum(batch.count() for batch in batches)
             return
+        datagrams, received = self._encoder.datagrams, self._encoder.bytes
         try:
             file = self._file_for(sum(batch.size for batch in batches), now)
             file.write(message for batch in batches for message in self._encoder.messages(batch))
         except Exception as error:
-            self.lost += datagrams
+            self.lost += sum(batch.count() for batch in batches)
             where, self._file = self.path or self._directory.path, None
             if not isinstance(error, OSError):
                 raise
@@ -325,8 +325,8 @@ class ContinuousWriter:
         if self._retry_at is not None:
             self._retry_at = None
             logger.info("recording resumed", file=str(file.path), lost=self.lost)
-        self.datagrams += datagrams
-        self.bytes += sum(batch.received for batch in batches)
+        self.datagrams += self._encoder.datagrams - datagrams
+        self.bytes += self._encoder.bytes - received
 
     def close_if_old(self, now: int) -> None:
         if self._file is not None and now - self._opened >= self._max_age:

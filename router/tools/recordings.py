@@ -13,7 +13,7 @@ from router.errors import TransportError, UsageError, did_you_mean
 from router.observe.tap import Lost
 from router.recording.about import about
 from router.recording.channels import Channels
-from router.recording.encoder import Batch, Batches, Encoder
+from router.recording.encoder import Batch, Clock, Encoder
 from router.recording.mirror import Action, Classifier, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import PERIOD
@@ -33,7 +33,7 @@ class TapRecording:
         self.path = path
         self.datagrams = self.missed = 0
         channels = Channels()
-        self._made = Batches()
+        self._clock = Clock()
         self._encoder = Encoder(channels)
         self._waiting: list[Batch] = []
         self._classifier = Classifier(envelope, table)
@@ -65,10 +65,10 @@ class TapRecording:
             else:
                 datagrams.append(mirrored)
         self.datagrams += len(datagrams)
-        if datagrams:
-            self._waiting.append(self._made.datagrams(datagrams, self._classifier, time_ns(), monotonic_ns()))
-        if actions:
-            self._waiting.append(self._made.actions(actions, self._classifier, time_ns(), monotonic_ns()))
+        if datagrams or actions:
+            now = monotonic_ns()
+            times = now, *self._clock.times(time_ns(), now)
+            self._waiting.append(Batch(datagrams, actions, self._classifier, *times))
         if monotonic_ns() - self._written_at >= PERIOD:
             self._write()
 

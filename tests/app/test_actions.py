@@ -113,7 +113,7 @@ def test_commands_that_are_lost_are_actions_with_the_reason(site: Site) -> None:
 def test_what_the_full_mirror_drops_is_counted_and_delays_no_brake(site: Site) -> None:
     with site.router(MANUAL) as router:
         router._runtime.plane.observe(is_observed=True)  # and nobody takes
-        for _ in range(6000):
+        for _ in range(14_000):
             site.send(DRIVE)
             assert site.basestation.recv(1000) in (DRIVE, BRAKE)
         wait_until(lambda: router.total("mirror_dropped") > 0)

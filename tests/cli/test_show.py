@@ -19,11 +19,11 @@ from router.cli.show import in_order, window
 from router.errors import UsageError
 from router.recording.about import RecordedRoute
 from router.recording.channels import Channels
-from router.recording.encoder import Batches, Encoder
+from router.recording.encoder import Encoder, Packer
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.recording.reader import Recording
 from router.recording.writer import RecordingFile
-from tests.recording.recorder_rig import MILLISECOND, SENSOR_BOARD, classifier, shown, wire
+from tests.recording.recorder_rig import MILLISECOND, SENSOR_BOARD, batched, shown, wire
 
 JUNK = "malformed: does not parse as rover_router.Recorded"
 CHECK = "Check its power, cable or radio, and address: `ping 10.0.0.7`, `tcpdump -n udp and host 10.0.0.7`."
@@ -96,7 +96,7 @@ def recording(
     channels = Channels()
     about = {"reason": "test", "table": "rover.yaml", "routes": json.dumps(routes), **more}
     file = RecordingFile(path, channels, {**about, "tripped": json.dumps(tripped)} if tripped else about)
-    made, encoder = Batches(), Encoder(channels)
+    packer, encoder = Packer(), Encoder(channels)
     batches: dict[int, list[MirroredDatagram | Action]] = {}
     for each in entries:
         batches.setdefault(each.at // (50 * MILLISECOND), []).append(each)
@@ -104,12 +104,7 @@ def recording(
         clocks = batch[-1].at, batch[-1].at - BEGIN
         datagrams = [each for each in batch if isinstance(each, MirroredDatagram)]
         actions = [each for each in batch if isinstance(each, Action)]
-        file.write(
-            [
-                *encoder.messages(made.datagrams(datagrams, classifier(), *clocks)),
-                *encoder.messages(made.actions(actions, classifier(), *clocks)),
-            ]
-        )
+        file.write(encoder.messages(batched(packer, datagrams, actions, clocks)))
     file.close()
     return str(path)
 

@@ -27,6 +27,7 @@ from router.observe.running import ReloadResult
 from router.observe.watch import Health, Watch
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.table.addresses import Address
+from tests.recording.recorder_rig import Listed
 from tests.tables import ROUTES
 
 SPAN = SourceSpan("routes/sim.yaml", 8, 20, 34)
@@ -68,11 +69,11 @@ class FakeRunning:
     def observe(self, *, is_observed: bool) -> None:
         pass
 
-    def take(self) -> list[Mirrored]:
-        return [self.waiting.popleft() for _ in range(len(self.waiting))]
+    def take(self) -> Listed:
+        return Listed(self.waiting.popleft() for _ in range(len(self.waiting)))
 
-    def take_actions(self) -> list[Acted]:
-        return [self.acted.popleft() for _ in range(len(self.acted))]
+    def take_actions(self) -> Listed:
+        return Listed(self.acted.popleft() for _ in range(len(self.acted)))
 
     def count(self, metric: str, *labels: str, to: float) -> None:
         """Times are in ns, as in the counters."""

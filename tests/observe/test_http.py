@@ -604,7 +604,7 @@ def test_closing_minds_nobody_who_has_gone(running: FakeRunning) -> None:
             caller.sendall(b"GET /tap HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             caller.close()
         server.close()
-    wait_until(lambda: not running.mirror._consumers, "the end of the taps")
+    wait_until(lambda: not running.mirror.is_observed, "the end of the taps")
 
 
 def test_closing_ends_what_is_open(running: FakeRunning) -> None:

@@ -197,7 +197,7 @@ def test_the_mirror_is_left_alone_when_nobody_looks_any_more(
 ) -> None:
     monkeypatch.setattr(last_values, "LOOKED_AT_SECONDS", 0.1)
     shown.numbers()
-    wait_until(lambda: not running.mirror._consumers, "the end of the look")
+    wait_until(lambda: not running.mirror.is_observed, "the end of the look")
     monkeypatch.setattr(last_values, "LOOKED_AT_SECONDS", 3600)
     shown.numbers()
-    assert running.mirror._consumers
+    assert running.mirror.is_observed

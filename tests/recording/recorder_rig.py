@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -16,8 +17,8 @@ from router.compiler.program import Program
 from router.datagrams import Peer, Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
-from router.recording.encoder import Batch, Batches, Encoder
-from router.recording.mirror import Action, Classifier, Mirror, MirroredDatagram
+from router.recording.encoder import Batch, Encoder, Packer
+from router.recording.mirror import Action, Classifier, Keeper, Mirror, MirroredDatagram
 from router.recording.reader import Recorded, Recording
 from router.recording.recorder import Recorder
 from router.recording.writer import RecordingFile
@@ -103,13 +104,30 @@ def seen(*datagrams: bytes, at: int = START, peer: Peer = SENSOR_BOARD, reason: 
 
 def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
     """A file with one chunk per batch, with a constant clock offset."""
-    made = Batches()
-    return write(path, Channels(), *(batched(made, batch) for batch in batches), finish=finish)
+    packer = Packer()
+    return write(path, Channels(), *(batched(packer, batch) for batch in batches), finish=finish)
 
 
-def batched(made: Batches, datagrams: Sequence[MirroredDatagram]) -> Batch:
-    """A batch with a constant clock offset."""
-    return made.datagrams(datagrams, classifier(), datagrams[-1].at, datagrams[-1].at - START)
+def batched(
+    packer: Packer,
+    datagrams: Sequence[MirroredDatagram],
+    actions: Sequence[Action] = (),
+    clocks: tuple[int, int] | None = None,
+) -> Batch:
+    """A batch, with a constant clock offset or with these `clocks`: wall and monotonic."""
+    wall, monotonic = clocks or (datagrams[-1].at, datagrams[-1].at - START)
+    return packer.pack(Listed(datagrams), Listed(actions), classifier(), wall, monotonic)
+
+
+class Listed(list[Any]):
+    """Datagrams or actions, as the mirror's keepers get them."""
+
+    @property
+    def records(self) -> bytes:
+        return pickle.dumps([*self]) if self else b""
+
+    def decode(self, records: bytes) -> Iterator[Any]:
+        return iter(pickle.loads(records) if records else ())  # noqa: S301 - what it has dumped
 
 
 def write(path: Path, channels: Channels, *batches: Batch, finish: bool = True) -> Path:
@@ -137,15 +155,18 @@ class FakeMirror:
     """Shows a test's datagrams at once, as of a router that runs `program`."""
 
     def __init__(self) -> None:
-        self.show: Callable[[Sequence[MirroredDatagram]], None] = print
-        self.act: Callable[[Sequence[Action]], None] = print
+        self.keeper: Keeper = print
         self.program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
 
-    def attach(
-        self, consumer: Callable[[Sequence[MirroredDatagram]], None], acted: Callable[[Sequence[Action]], None]
-    ) -> Callable[[], None]:
-        self.show, self.act = consumer, acted
+    def keep(self, keeper: Keeper) -> Callable[[], None]:
+        self.keeper = keeper
         return lambda: None
+
+    def show(self, datagrams: Sequence[MirroredDatagram]) -> None:
+        self.keeper(Listed(datagrams), Listed())
+
+    def act(self, actions: Sequence[Action]) -> None:
+        self.keeper(Listed(), Listed(actions))
 
     def deliver(self, patience: float) -> bool:
         """Nothing waits."""

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.recording.channels import MOST_CHANNELS, Channels
-from router.recording.encoder import Batches, Encoder
+from router.recording.encoder import Encoder, Packer
 from router.types.wire import varint
 from tests.recording.recorder_rig import (
     MILLISECOND,
@@ -24,7 +24,6 @@ from tests.recording.recorder_rig import (
     STRANGER,
     again,
     batched,
-    classifier,
     datagrams,
     imu,
     read,
@@ -90,7 +89,7 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
         shown(padded, listener="exact", reason="malformed"),
     ]
     channels = Channels()
-    messages = Encoder(channels).messages(batched(Batches(), batch))
+    messages = Encoder(channels).messages(batched(Packer(), batch))
     by_topic = Counter(channels.channels[message.channel].topic for message in messages)
     assert by_topic == {"raw/datagrams": 1, "imu_info": 1, "rejected/malformed/raw/datagrams": 1}
 
@@ -98,7 +97,7 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
     many = [shown(imu(), START + n, (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1)) for n in range(MOST_CHANNELS + 10)]
-    messages = [*Encoder(channels).messages(batched(Batches(), many))]
+    messages = [*Encoder(channels).messages(batched(Packer(), many))]
     assert {message.sequence for message in messages} == set(range(1, len(many) + 1))
     assert len(channels.channels) == MOST_CHANNELS + 2  # the raw datagrams, and their payloads to look at
 
@@ -116,10 +115,10 @@ def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many
 
 def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:
     """A rover without a battery for its clock: GPS comes up, then somebody sets it back."""
-    made = Batches()
+    packer = Packer()
     walls = [0, START, START + 20 * MILLISECOND, START // 2, START // 2]
     batches = [
-        made.datagrams(seen(imu(), at=wall), classifier(), wall, number * 20 * MILLISECOND)
+        batched(packer, seen(imu(), at=wall), clocks=(wall, number * 20 * MILLISECOND))
         for number, wall in enumerate(walls)
     ]
     found = read(write(tmp_path / "it.mcap", Channels(), *batches))
@@ -129,11 +128,11 @@ def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tm
 
 @given(st.lists(st.tuples(st.integers(0, 10**18), st.integers(0, 10**10)), min_size=2, max_size=20))
 def test_steady_times_never_go_back_and_never_run_ahead(clocks: list[tuple[int, int]]) -> None:
-    made, batches = Batches(), []
+    packer, batches = Packer(), []
     now = 0
     for wall, passed in clocks:
         now += passed
-        batches.append(made.datagrams(seen(imu(), at=wall), classifier(), wall, now))
+        batches.append(batched(packer, seen(imu(), at=wall), clocks=(wall, now)))
     with tempfile.TemporaryDirectory() as folder:
         found = read(write(Path(folder) / "it.mcap", Channels(), *batches))
     assert all(first.steady <= second.steady for first, second in pairwise(found))

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import pytest
 
 from router.recording import mirror
-from router.recording.mirror import Acted, Consumer, Mirror, Mirrored, MirroredDatagram
+from router.recording.mirror import Acted, Consumer, Mirror, Mirrored, MirroredDatagram, Taken
+from tests.recording.recorder_rig import Listed
 
 PEER = ("127.0.0.2", 8)
 
@@ -30,11 +31,11 @@ class Source:
         if self.mirror.is_observed:
             self._kept.append((len(self._kept), "rover", PEER, "board", "", data))
 
-    def take(self) -> list[Mirrored]:
-        return [self._kept.popleft() for _ in range(len(self._kept))]
+    def take(self) -> Listed:
+        return Listed(self._kept.popleft() for _ in range(len(self._kept)))
 
-    def take_actions(self) -> list[Acted]:
-        return [self.actions.popleft() for _ in range(len(self.actions))]
+    def take_actions(self) -> Listed:
+        return Listed(self.actions.popleft() for _ in range(len(self.actions)))
 
     def observe(self, *, is_observed: bool) -> None:
         self.observed.append(is_observed)
@@ -66,7 +67,7 @@ def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> 
 
 
 def test_what_waits_is_delivered_at_once_on_demand(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mirror, "PERIOD", 60.0)
+    monkeypatch.setattr(mirror, "PERIOD", 60 * 10**9)
     got: list[Mirrored] = []
     detach = source.mirror.attach(got.extend)
     source.receive(b"1")
@@ -76,7 +77,7 @@ def test_what_waits_is_delivered_at_once_on_demand(source: Source, monkeypatch: 
 
 
 def test_who_waits_for_a_hung_consumer_is_told(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mirror, "PERIOD", 0.01)
+    monkeypatch.setattr(mirror, "PERIOD", 10**7)
     hangs, may_go_on = threading.Event(), threading.Event()
 
     def hang(_: Sequence[Mirrored]) -> None:
@@ -114,10 +115,30 @@ def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) 
 
 def test_closing_shows_what_waits(source: Source) -> None:
     got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
-    source.mirror.attach(into(got))
+    detach = source.mirror.attach(into(got))
     source.receive(b"last")
     source.mirror.close()
+    detach()
     assert got.get_nowait().data == b"last"
+    assert source.observed == [True, False]
+
+
+def test_a_keeper_gets_what_is_decoded_later(source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror, "KEEPING_PERIOD", 60 * 10**9)
+    kept: list[tuple[Taken[Mirrored], Taken[Acted]]] = []
+    shown: list[Mirrored] = []
+    detach = source.mirror.keep(lambda *taken: kept.append(taken))
+    source.receive(b"1")
+    source.actions.append((1, "tripped", "drive", "", "", "", "", b""))
+    source.mirror.deliver()
+    source.mirror.attach(shown.extend)
+    source.receive(b"2")
+    source.mirror.deliver()
+    assert [data for datagrams, _ in kept for *_, data in datagrams.decode(datagrams.records)] == [b"1", b"2"]
+    assert [route for _, actions in kept for _, _, route, *_ in actions] == ["drive"]
+    assert [data for *_, data in shown] == [b"2"]
+    detach()
+    source.mirror.close()
 
 
 def test_a_consumer_that_fails_is_told_of_and_spares_the_others(source: Source) -> None:

@@ -24,7 +24,7 @@ from router.recording import incidents as incidents_module
 from router.recording import recorder as recorder_module
 from router.recording import writer as writer_module
 from router.recording.about import tripped_in
-from router.recording.encoder import Batches, Encoder, Message
+from router.recording.encoder import Encoder, Message, Packer
 from router.recording.mirror import TRIPPED, Action, MirroredDatagram
 from router.recording.reader import RecordedAction, Recording
 from router.recording.recorder import Recorder, RecordError, Ring
@@ -33,7 +33,7 @@ from tests.recording.recorder_rig import (
     START,
     FakeMirror,
     again,
-    classifier,
+    batched,
     imu,
     read,
     recorder,
@@ -340,6 +340,20 @@ def test_a_board_that_does_not_answer_delays_a_recording_for_some_seconds_only(
         until(lambda: files(tmp_path), "it was never saved")
 
 
+def test_a_stop_at_the_end_is_saved_in_time_with_its_newest_datagrams(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "MOST_AT_STOP", 25_000)
+    monkeypatch.setattr(recorder_module, "AFTERMATH", 3600 * 10**9)
+    batches = [now(os.urandom(10_000)) for _ in range(5)]
+    with capture_logs() as logs, running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+        for batch in batches:
+            mirror.show(batch)
+        made.deadman_tripped("drive")
+    assert [again(each) for each in read(files(tmp_path)[0])] == [*batches[3], *batches[4]]
+    assert [each["log_level"] for each in logs] == ["warning", "info"]
+
+
 def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
     with running_recorder(tmp_path) as (made, _):
         made.deadman_tripped("drive_motor")
@@ -608,17 +622,17 @@ def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
 
 
 def test_a_ring_has_what_came_in_its_time() -> None:
-    ring, made = Ring(10, 1 << 20), Batches()
+    ring, packer = Ring(10, 1 << 20), Packer()
     for time in range(0, 30, 3):
-        ring.add(made.datagrams(seen(b"x"), classifier(), START, time))
+        ring.add(batched(packer, seen(b"x"), clocks=(START, time)))
     assert [each.monotonic for each in ring.batches()] == [18, 21, 24, 27]
 
 
 def test_a_ring_never_takes_more_than_it_may_but_for_the_last_batch() -> None:
-    ring, made = Ring(10**9, 10_000), Batches()
+    ring, packer = Ring(10**9, 10_000), Packer()
     for time in range(100):
-        ring.add(made.datagrams(seen(os.urandom(1000)), classifier(), START, time))
+        ring.add(batched(packer, seen(os.urandom(1000)), clocks=(START, time)))
         assert sum(each.size for each in ring.batches()) <= 10_000
     assert len(ring.batches()) > 5
-    ring.add(made.datagrams(seen(*[os.urandom(16_000) for _ in range(4)]), classifier(), START, 100))
+    ring.add(batched(packer, seen(*[os.urandom(16_000) for _ in range(4)]), clocks=(START, 100)))
     assert len(ring.batches()) == 1

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from router.errors import UsageError
 from router.recording.channels import DATAGRAMS, Channels
-from router.recording.encoder import Batches, Encoder
+from router.recording.encoder import Encoder, Packer
 from router.recording.reader import Recording
 from router.recording.writer import RecordingFile
 from tests.recording.recorder_rig import (
@@ -238,9 +238,9 @@ def test_a_recording_that_another_tool_rewrote_is_read_like_the_first(
 
 
 def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    channels, made = Channels(), Batches()
+    channels, packer = Channels(), Packer()
     file, encoder = RecordingFile(tmp_path / "it.mcap", channels, {}), Encoder(channels)
-    file.write(encoder.messages(batched(made, BATCHES[0])))
+    file.write(encoder.messages(batched(packer, BATCHES[0])))
     size, real = file.size, os.write
 
     def full(descriptor: int, data: bytes) -> int:
@@ -251,16 +251,16 @@ def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch
     with monkeypatch.context() as failing:
         failing.setattr(os, "write", full)
         with pytest.raises(OSError, match="No space"):
-            file.write(encoder.messages(batched(made, BATCHES[1])))
+            file.write(encoder.messages(batched(packer, BATCHES[1])))
     assert file.size == size == (tmp_path / "it.mcap").stat().st_size
     file.close()
     assert [again(each) for each in read(tmp_path / "it.mcap")] == BATCHES[0]
 
 
 def test_channels_are_written_only_into_files_that_use_them(tmp_path: Path) -> None:
-    channels, made = Channels(), Batches()
+    channels, packer = Channels(), Packer()
     for name, batch in (("first.mcap", BATCHES[0]), ("second.mcap", BATCHES[2])):
-        write(tmp_path / name, channels, batched(made, batch))
+        write(tmp_path / name, channels, batched(packer, batch))
     with (tmp_path / "second.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
