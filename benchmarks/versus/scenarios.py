@@ -20,6 +20,7 @@ from benchmarks.versus.trial import Measure
 RATES = (1000, 5000, 20_000, 40_000)
 SIZE_RATES = (5000, 20_000)
 FORWARD_RATES = (200, 1000, 5000, 20_000)
+RECORD_RATES = (1000, 5000, 20_000)
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,13 @@ SCENARIOS = (
         (Router("router", TABLES / "forward.yaml"), Native("bare", "bare_forward")),
         partial(inbound_cost, rates=FORWARD_RATES, topics=()),
         cpu_at_most("bare", (1.3,) * 4, FORWARD_RATES),
+    ),
+    Scenario(
+        "record_last",
+        "CPU per datagram: one destination, no topic, the last minute kept in memory or not",
+        (Router("router", TABLES / "record_last.yaml"), Router("unrecorded", TABLES / "forward.yaml")),
+        partial(inbound_cost, rates=RECORD_RATES, topics=()),
+        cpu_at_most("unrecorded", (1.1, 1.1, 1.1), RECORD_RATES),
     ),
     Scenario(
         "max_rate",
