@@ -1,9 +1,9 @@
-"""The adoption of a program, and what takes part in it."""
+"""The adoption of a program, as its participants (`runtime.py`) see it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from router.carrier.loading import LoadedImage
 from router.carrier.ros_routes import RosRoutes
@@ -31,19 +31,3 @@ class Change:
     ros: RosChange | None = None
     routes: RosRoutes | None = None
     gateways: GatewayChange | None = None
-
-
-class Participant(Protocol):
-    """Takes part in an adoption, in these steps. Only `prepare` may fail, and `adopt` where the table says so."""
-
-    def prepare(self, change: Change) -> None:
-        """Open what the program needs in addition. Raises StartError with nothing changed."""
-
-    def undo(self, change: Change) -> None:
-        """Close what `prepare` has opened; it was called before, but may have failed for others."""
-
-    def adopt(self, change: Change) -> None:
-        """Change to the program."""
-
-    def finish(self, change: Change) -> None:
-        """Close what only the earlier program used, once no thread uses it."""

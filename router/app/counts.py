@@ -59,9 +59,6 @@ class ThreadCounts:
             for run in new:  # a program that was abandoned may have counted there
                 counts[run] = [0] * (run.stop - run.start)
 
-    def undo(self, change: Change) -> None:
-        """Do nothing: the room is used by the next program."""
-
     def adopt(self, change: Change) -> None:
         """Adopt its counters. The indexes of earlier ones stay reserved, because threads may still use them."""
         self.counters = change.program.counters  # from now on, other threads read them

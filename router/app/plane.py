@@ -75,13 +75,6 @@ class Images:
                 if sent:
                     logger.info("the deadman has sent its payload at startup", route=route, to=sent)
 
-    def undo(self, change: Change) -> None:
-        """Free the image."""
-        change.image = None
-
-    def adopt(self, change: Change) -> None:
-        """Do nothing: the threads change to the image."""
-
     def finish(self, change: Change) -> None:
         """End the deadmen that only the earlier image had, and free what only it used; armed deadmen send."""
         if change.before is not None and change.image is not None:
@@ -188,9 +181,6 @@ class Plane:
             for deadman in image.client_deadmen.values():
                 deadman.await_subscribers(boottime_ns())
 
-    def undo(self, change: Change) -> None:
-        """Do nothing: threads that were started serve the next program."""
-
     def adopt(self, change: Change) -> None:
         """Switch to the image; the first one starts the threads. Listeners that it lacks are drained.
 
@@ -223,12 +213,8 @@ class Plane:
         for thread, other in zip(self._from_ros, reversed(self._from_ros), strict=True):
             thread.follow(other)
             thread.adopt(routes)
-        self.now = Running(change.program, image)
+        self.now, self._head_start = Running(change.program, image), None
         self._programs = {**(self._programs if change.is_first else {}), image.generation: change.program}
-
-    def finish(self, change: Change) -> None:
-        """Do nothing: no thread uses the earlier image any more (`wait_until_adopted`)."""
-        self._head_start = None
 
     def wait_until_adopted(self) -> bool:
         """Wait until nothing of an earlier image is in use. Return False if that takes longer than a second."""

@@ -15,8 +15,8 @@ then `adopt` up, then `finish` up; if a step is refused, `undo` up the table lea
 
 Down the table, each needs what is above it. Up the table, each stops using what is above it: gateways close before the
 deadmen of their clients publish a last time, and the threads change before sockets and topics are closed. Nothing is
-closed while a thread that is stuck in the middleware may use it: then `finish` is repeated at the next reload, except
-for gateways.
+closed while a thread that is stuck in the middleware may use it: then `finish` waits for the next reload, except for
+gateways.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
-from router.app.change import Change, Participant
+from router.app.change import Change
 from router.app.gateways import Gateways
 from router.app.plane import Images, Plane
 from router.app.sockets import KernelDrops, Sockets
@@ -62,7 +62,7 @@ class Runtime:
         self.sockets = Sockets(self.drops, plane.library, head_start)
         self.topics = Topics(ros_args, self._note_incompatible, plane.subscriber_joined)
         self.gateways = Gateways(self.topics, self.drops, self.counts, reporter)
-        self._others: Sequence[Participant] = [self.counts, self.sockets, Images(forwarding, head_start), self.topics]
+        self._images = Images(forwarding, head_start)
         self._unfinished: list[Change] = []
 
     @property
@@ -86,10 +86,10 @@ class Runtime:
     def start(self, program: Program) -> Change:
         """Adopt the first program, then open its gateways, which takes longer. Raises StartError: then close it."""
         with background_threads():
-            change = self._prepare(program, [*self._others, self.plane])
+            change = self._prepare(program)
         self.adopt(change)
         with background_threads():
-            self._prepare_for(change, [self.gateways])
+            self.gateways.prepare(change)
             self.finish(change)
         return change
 
@@ -97,28 +97,30 @@ class Runtime:
         """Open what `program` needs that is not open yet. Raises StartError with nothing changed."""
         if self._unfinished and self.plane.wait_until_adopted():
             self._finish_all()  # before `program` opens the same addresses or topics
-        return self._prepare(program, [*self._others, self.plane, self.gateways])
+        change = self._prepare(program)
+        with ExitStack() as undo:
+            undo.callback(self.undo, change)
+            self.gateways.prepare(change)
+            undo.pop_all()
+        return change
 
-    def _prepare(self, program: Program, participants: Sequence[Participant]) -> Change:
+    def _prepare(self, program: Program) -> Change:
         for missing in missing_extras(program.table):
             raise missing
         _check_ports(program, os.environ)
         self.topics.check(program)
         change = Change(program, self.plane.image, is_first=self.plane.now is None)
-        self._prepare_for(change, participants)
-        return change
-
-    def _prepare_for(self, change: Change, participants: Sequence[Participant]) -> None:
         with ExitStack() as undo:
-            for each in participants:
-                undo.callback(each.undo, change)
+            undo.callback(self.undo, change)
+            for each in (self.counts, self.sockets, self._images, self.topics, self.plane):
                 each.prepare(change)
             undo.pop_all()
+        return change
 
     def undo(self, change: Change) -> None:
         """Close what was opened for a program that is not adopted."""
-        with ExitStack() as up:
-            for each in (*self._others, self.plane, self.gateways):
+        with ExitStack() as up:  # all of them, even if one raises
+            for each in (self.sockets, self.topics, self.gateways):
                 up.callback(each.undo, change)
 
     def adopt(self, change: Change) -> None:
@@ -131,7 +133,7 @@ class Runtime:
             raise
         try:
             with ExitStack() as up:  # all of them, even if one raises
-                for each in self._others:
+                for each in (self.counts, self.sockets, self.topics):
                     up.callback(each.adopt, change)
         except Exception as error:  # noqa: BLE001 a bug is logged: the program runs
             fault(error, "occurred after the threads had changed to another program").log()
@@ -139,17 +141,17 @@ class Runtime:
     def finish(self, change: Change) -> None:
         """Close what only the earlier program used; all of it, even if closing something raises."""
         self._unfinished.append(change)
-        with ExitStack() as last_first:
+        with ExitStack() as up:
             if change.before is None or self.plane.wait_until_adopted():
-                last_first.callback(self._finish_all)
-            last_first.callback(self.gateways.finish, change)
+                up.callback(self._finish_all)
+            up.callback(self.gateways.finish, change)
 
     def _finish_all(self) -> None:
         """Finish this adoption and earlier ones that could not, the newest first. Try each once."""
         changes, self._unfinished = self._unfinished, []
         with ExitStack() as up:
             for change in changes:
-                for each in (*self._others, self.plane):
+                for each in (self.counts, self.sockets, self._images, self.topics):
                     up.callback(each.finish, change)
 
     def take_over(self, program: Program) -> None:

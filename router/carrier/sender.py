@@ -12,7 +12,8 @@ from router.net.sockets import ListeningSocket, address_beside, is_beside, leave
 class NativeSender:
     """Sends to one address, through a socket that `net.sockets.open_sending` has opened for `source`. Owns the socket.
 
-    `address` is that of its `struct sender`.
+    `address` is that of its `struct sender`. `leaves_from` is the address that the socket is bound to, 0.0.0.0 if the
+    kernel chooses one for each datagram; `is_bound`: it sends from the port of its listener.
     """
 
     def __init__(
@@ -24,8 +25,7 @@ class NativeSender:
     ) -> None:
         """Raises MemoryError."""
         self._library = library
-        self.socket = opened
-        self.source = source
+        self._place(source, opened)
         host, port = destination
         number = int.from_bytes(socket.inet_aton(host), "big")
         self.address = int(library.sender_open(opened.fileno(), self._listening, number, port) or 0)
@@ -35,30 +35,21 @@ class NativeSender:
 
     def move(self, source: ListeningSocket | None, opened: socket.socket) -> socket.socket:
         """Send through `opened` from now on. Return the earlier socket; close it when no thread uses it."""
-        left, self.socket, self.source = self.socket, opened, source
+        left = self.socket
+        self._place(source, opened)
         self._library.sender_move(self.address, opened.fileno(), self._listening)
         return left
+
+    def _place(self, source: ListeningSocket | None, opened: socket.socket) -> None:
+        self.socket, self.source = opened, source
+        self.is_bound, self.leaves_from = is_beside(opened), leaves_from(opened)
+        self._listening = source.socket.fileno() if source is not None and self.is_bound else -1
 
     def is_placed(self, source: ListeningSocket | None, listening: Collection[ListeningSocket]) -> bool:
         """Return whether a newly opened socket would have the same source address and port."""
         if self.source is not source or source is None or not self.is_bound:
             return self.source is source
         return self.leaves_from == address_beside(source, listening)[0]
-
-    @property
-    def leaves_from(self) -> str:
-        """The address that the socket is bound to; 0.0.0.0 if the kernel chooses one for each datagram."""
-        return leaves_from(self.socket)
-
-    @property
-    def is_bound(self) -> bool:
-        """Whether it sends from the port of its listener."""
-        return is_beside(self.socket)
-
-    @property
-    def _listening(self) -> int:
-        """The descriptor of the listener from whose port it sends; -1 for none."""
-        return self.source.socket.fileno() if self.source is not None and self.is_bound else -1
 
     def close(self) -> None:
         """Close the socket. Sending afterwards raises OSError."""
