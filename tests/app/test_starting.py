@@ -192,7 +192,8 @@ def test_the_metrics_say_how_it_started(table: Path, tmp_path: Path, monkeypatch
     assert started("--no-cache") == "compiled"
     assert started() == "compiled"
     assert started() == "kept"
-    assert started(edit="# a comment\n") == "replaced"
+    assert started(edit="# a comment\n") == "kept"
+    assert started(edit="  gps_info: {source: any, destinations: [basestation]}\n") == "replaced"
     table.write_text(f"{table.read_text()}# another one\n")
     assert started() == "refused"
     assert started() == "kept"
