@@ -100,7 +100,7 @@ class Delivering:
         routines = Routines(lowered.layout, self._arrays)
         wanted, is_from_ros = (ctypes.c_uint8 * 1)(1), isinstance(lowered, LoweredFeed)
         topic = c.Topic(wanted=ctypes.addressof(wanted))
-        self._arrays.keep(wanted, topic)
+        self._held: list[object] = [wanted, topic]
         targets = []
         for number, target in enumerate(self._lowered):
             first = 1 + number * _OF_TARGET
@@ -130,7 +130,7 @@ class Delivering:
             collect = write_collect(lowered.collect, routines, range(1 + len(others)))
             collect.collector = collector.address
             self._targets.collect = ctypes.pointer(collect)
-            self._arrays.keep(collector)
+            self._held.append(collector)
         self._targets.layout = routines.layout()
         if self._route is not None:
             self._route.targets = self._targets

@@ -12,16 +12,11 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Arrays:
-    """C structures and arrays, which live as long as this object.
-
-    All of a program's memory is in `blocks`, so that an image of it can be made (`image.py`). Other objects that the
-    program uses, for example senders, are only kept alive.
-    """
+    """C structures and arrays, which live as long as this object: all of an image's memory."""
 
     blocks: list[Any] = field(default_factory=list)
     references: list[int] = field(default_factory=list)
     """Addresses of words that hold a pointer although their C type does not show it."""
-    _kept: list[object] = field(default_factory=list)
 
     def add(self, structure: T) -> T:
         """Take ownership of a structure or an array, and return it."""
@@ -35,18 +30,3 @@ class Arrays:
     def text(self, data: bytes) -> int:
         """Copy bytes, and return the address of the copy, which is never 0."""
         return ctypes.addressof(self.add(ctypes.create_string_buffer(data, len(data) + 1)))
-
-    def keep(self, *others: object) -> None:
-        """Keep alive objects that are not memory of the program."""
-        self._kept += others
-
-    def include(self, others: Arrays) -> None:
-        """Share the ownership of everything that `others` owns."""
-        self.blocks += others.blocks
-        self.references += others.references
-        self._kept += others._kept
-
-    def clear(self) -> None:
-        self.blocks.clear()
-        self.references.clear()
-        self._kept.clear()
