@@ -8,7 +8,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from queue import SimpleQueue
 from time import monotonic, sleep
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -55,6 +56,8 @@ class Thread(threading.Thread):
     def run(self) -> None:
         if not self._first.acquire(blocking=False):
             return
+        with suppress(OSError):  # no file descriptor is left, or /proc is read-only
+            Path("/proc/thread-self/comm").write_text(self.name[:15])
         while True:
             try:
                 self._call(*self._arguments)

@@ -15,6 +15,7 @@ from structlog.testing import capture_logs
 
 from router import threads
 from router.threads import DaemonThread, StopStack, Thread, background_threads, join_or_abandon
+from tests.tasks import thread_names
 
 TIMEOUT_S = 20.0
 
@@ -35,6 +36,14 @@ def test_threads_started_inside_are_batch_and_those_after_are_not() -> None:
 
 def test_a_thread_whose_start_failed_needs_no_end() -> None:
     assert join_or_abandon(Thread(lambda: None, "test"))
+
+
+def test_the_kernel_knows_the_name_of_a_thread() -> None:
+    names: list[str] = []
+    thread = Thread(lambda: names.extend(thread_names()), "a very long name")
+    thread.start()
+    thread.join()
+    assert "a very long nam" in names
 
 
 def test_the_policy_returns_after_an_error() -> None:

@@ -65,8 +65,8 @@ def main() -> None:
     if any(contender.realtime for scenario in args.only for contender in scenario.contenders):
         _require_realtime()
     build()
-    for routes in (sized.SMALL, sized.LARGE, sized.LARGEST):
-        sized.write(routes, sized.folder(routes))
+    for size in sized.SIZES:
+        sized.write(size, size.folder)
     unrecorded.write()
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -13,6 +13,7 @@ from benchmarks.versus.figures import Aim
 from benchmarks.versus.flood import flood
 from benchmarks.versus.footprint import start_and_memory, start_and_reload
 from benchmarks.versus.helpers import ALL_TOPICS, IMU
+from benchmarks.versus.idle import idle_cpu
 from benchmarks.versus.latencies import latency, latency_beside_busy
 from benchmarks.versus.limits import highest_rate, overload
 from benchmarks.versus.trial import Measure
@@ -61,9 +62,9 @@ def for_both(limits: dict[str, float]) -> tuple[Aim, ...]:
     return at_most("peer", limits) + at_most("peer_realtime", limits, "router_realtime")
 
 
-def sized_router(name: str, routes: int, spread: bool = False) -> Router:
-    """One with so many routes; with `spread`, datagrams are of all their payload cases."""
-    folder = sized.folder(routes)
+def sized_router(name: str, size: sized.Size, spread: bool = False) -> Router:
+    """One with a table of this size; with `spread`, datagrams are of all its payload cases."""
+    folder = size.folder
     return Router(name, folder / "table.yaml", payloads=folder / "payloads.txt" if spread else PAYLOADS)
 
 
@@ -195,6 +196,22 @@ SCENARIOS = (
             Aim("ros_s", of="routes_1000"),
             Aim("ros_s@again", of="routes_1000"),
             Aim("reload_s", of="routes_1000", at_most=3.0),
+        ),
+    ),
+    Scenario(
+        "idle",
+        "CPU in percent of a core without traffic and clients: the rover's whole table; 1,000 and 2,500 routes with "
+        "`http`; 900 topics without it",
+        (
+            Router("shipped", TABLES / "shipped.yaml"),
+            sized_router("routes_1000", sized.MANY),
+            sized_router("routes_2500", sized.MOST),
+            sized_router("topics_900", sized.ALL_PUBLISHED),
+        ),
+        idle_cpu,
+        tuple(
+            Aim("cpu_percent", of=name, at_most=limit)
+            for name, limit in (("shipped", 0.5), ("routes_1000", 0.6), ("routes_2500", 0.8), ("topics_900", 0.3))
         ),
     ),
     Scenario(

@@ -1,8 +1,7 @@
 """Route tables of any size, with the .proto files and datagrams that go with them. Knows nothing of measuring.
 
 Four payload cases are the rover's, under their own numbers; the others are copies of those four messages under names
-and numbers of their own. Each case has a route with one destination and two topics; in the largest table, which
-would have too many values, one.
+and numbers of their own. Each case has a route with one destination.
 """
 
 from __future__ import annotations
@@ -22,11 +21,31 @@ from router.types.wire import LEN
 from tests.envelopes import tag
 from tests.tables import PROTOS
 
-SMALL, LARGE, LARGEST = 26, 260, 1000
 FIRST_COPY = 101
 """Field number, above all of the rover's."""
 
 ENVELOPE = Path("components", "common", "envelope.proto")
+
+
+class Size(NamedTuple):
+    """How many routes a table has, with so many topics each, and whether it has `http`."""
+
+    routes: int
+    topics: int = 2
+    http: bool = True
+
+    @property
+    def folder(self) -> Path:
+        """Where `write` puts the table by default."""
+        return PROGRAMS / f"routes_{self.routes}_{self.topics}{'' if self.http else '_alone'}"
+
+
+SMALL, LARGE = Size(26), Size(260)
+LARGEST = Size(1000, topics=1)
+"""With two topics each it would have too many values."""
+MANY, MOST, ALL_PUBLISHED = Size(1000, topics=0), Size(2500, topics=0), Size(900, topics=1, http=False)
+"""Sizes for idling."""
+SIZES = (SMALL, LARGE, LARGEST, MANY, MOST, ALL_PUBLISHED)
 
 
 class Case(NamedTuple):
@@ -50,21 +69,15 @@ REAL = tuple(
 )
 
 
-def folder(count: int) -> Path:
-    """Where `write` puts the table of so many routes."""
-    return PROGRAMS / f"routes_{count}"
-
-
-def write(count: int, target: Path) -> None:
+def write(size: Size, target: Path) -> None:
     """Makes table.yaml, payloads.txt with a datagram of each case, and protos/ in a folder."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(PROTOS, target / "protos", ignore=shutil.ignore_patterns("*.lock.json"))
-    all_cases = list(_cases(count))
+    all_cases = list(_cases(size.routes))
     (target / "protos" / ENVELOPE).write_text(_envelope(all_cases), encoding="utf-8")
     (target / "payloads.txt").write_text("\n".join(_payloads(all_cases)), encoding="utf-8")
-    (target / "table.yaml").write_text(
-        yaml.safe_dump(_table(all_cases, 1 if count == LARGEST else 2), sort_keys=False), encoding="utf-8"
-    )
+    table = yaml.safe_dump(_table(all_cases, size), sort_keys=False)
+    (target / "table.yaml").write_text(table, encoding="utf-8")
 
 
 def _cases(count: int) -> Iterator[Case]:
@@ -94,21 +107,23 @@ def _payloads(cases: Sequence[Case]) -> Iterator[str]:
         yield f"{case.name} {(tag(case.number, LEN) + behind_tag).hex()}"
 
 
-def _table(cases: Sequence[Case], topics: int) -> dict[str, Any]:
+def _table(cases: Sequence[Case], size: Size) -> dict[str, Any]:
     return {
         "version": 1,
         "envelope": {"protos": "protos", "message": "PBEnvelope", "oneof": "payload"},
-        "http": {"address": "127.0.0.1:${METRICS_PORT:-29108}"},
+        **({"http": {"address": "127.0.0.1:${METRICS_PORT:-29108}"}} if size.http else {}),
         "listen": {"all": {"address": "127.0.0.1:${LISTEN_PORT:-5000}"}},
         "endpoints": {
             "sensor_board": {"address": "127.0.0.30:8", "kind": "board"},
             "first": {"address": "127.0.0.1:${FIRST_PORT:-6000}", "kind": "tool"},
         },
-        "routes": {
-            case.name: {"source": "sensor_board", "destinations": ["first"], "topics": list(_topics(case))[:topics]}
-            for case in cases
-        },
+        "routes": {case.name: _route(case, size.topics) for case in cases},
     }
+
+
+def _route(case: Case, topics: int) -> dict[str, Any]:
+    route: dict[str, Any] = {"source": "sensor_board", "destinations": ["first"]}
+    return route | {"topics": list(_topics(case))[:topics]} if topics else route
 
 
 def _topics(case: Case) -> Iterator[dict[str, Any]]:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
@@ -82,9 +83,15 @@ class Subject(AbstractContextManager["Subject"]):
         return {"copies": self.contender.copies, "receive_buffer": int(buffers[0]), "realtime": int(realtime)}
 
     def cpu_ns(self) -> int:
-        """CPU time of all living threads: schedstat counts ns where utime and stime count ticks."""
-        tasks = (path for pid in self.pids() for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))
-        return sum(int((read(path) or "0").split()[0]) for path in tasks)
+        """CPU time of all living threads."""
+        return self.cpu_by_thread().total()
+
+    def cpu_by_thread(self) -> Counter[str]:
+        """CPU time (ns) of the living threads, by name: schedstat counts ns where utime and stime count ticks."""
+        used: Counter[str] = Counter()
+        for task in (task for pid in self.pids() for task in Path(f"/proc/{pid}/task").glob("*")):
+            used[read(task / "comm").strip()] += int((read(task / "schedstat") or "0").split()[0])
+        return used
 
     def kernel_drops(self) -> int:
         """Datagrams for which its first listener had no room, since it was opened."""

@@ -22,5 +22,6 @@ def write() -> None:
     text = rover.read_text(encoding="utf-8")
     rover.write_text(re.sub(r"^record:.*\n(?: .*\n)+", "", text, flags=re.MULTILINE), encoding="utf-8")
     TABLE.parent.mkdir()
-    extends = (TABLES / "rover.yaml").read_text(encoding="utf-8").replace("../../tests/rover/", "../")
-    TABLE.write_text(extends, encoding="utf-8")
+    for name in ("shipped.yaml", TABLE.name):
+        text = (TABLES / name).read_text(encoding="utf-8").replace("../../tests/rover/", "../")
+        (TABLE.parent / name).write_text(text, encoding="utf-8")

@@ -15,7 +15,7 @@ from benchmarks.versus.building import ROOT, missing_packages
 pytestmark = pytest.mark.slow
 
 PATIENCE = 300
-ONLY = ["own_table", "latency_thick", "outbound", "footprint", "flood"]
+ONLY = ["own_table", "latency_thick", "outbound", "footprint", "idle", "flood"]
 """One of each way of measuring that is done soon."""
 
 
