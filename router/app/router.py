@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from types import TracebackType
@@ -28,8 +28,10 @@ from router.log import logger
 from router.net.doors import Door
 from router.net.udp import Listener
 from router.observe.obedience import Obedience, Replies
+from router.observe.readings import Readings, SeriesFunction
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
+from router.observe.snapshot import SERIES, Snapshot
 from router.recording.mirror import Mirror
 from router.startup_image.head_start import HeadStart
 from router.table.addresses import Address
@@ -40,7 +42,6 @@ if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time 
     from prometheus_client.metrics_core import Metric as Family
 
     from router.gateway.clients import ClientQueue
-    from router.observe.metrics import CountersCollector, SeriesFunction
     from router.recording.recorder import Recorder
 
 _TOTALS = (
@@ -90,7 +91,7 @@ class Router:
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._known: Mapping[str, int] = dict.fromkeys(program.table.endpoints, boottime_ns())
-        self._collector: tuple[Program, CountersCollector] | None = None
+        self._readings: tuple[Program, Readings] | None = None
         self._open = StopStack()
 
     def __enter__(self) -> Router:
@@ -183,10 +184,20 @@ class Router:
         self._runtime.plane.feed_watchdog(notify, interval)
 
     def collect(self) -> Iterator[Family]:
-        if (made := self._collector) is None or made[0] is not self.program:
-            program = self.program
-            made = self._collector = (program, self._new_collector(program))
-        return made[1].collect()
+        from router.observe.metrics import CountersCollector
+
+        program, readings = self._current_readings()
+        build = {
+            "version": __version__,
+            "table_sha256": program.table.sha256,
+            "protos_sha256": program.protos_sha256,
+            "start": self._start,
+        }
+        return CountersCollector(readings, build).collect()
+
+    def read(self, now: int, metrics: Collection[str] = SERIES) -> Snapshot:
+        _, readings = self._current_readings()
+        return Snapshot(now / 1e9, readings.read(now, metrics))
 
     def reload(self) -> ReloadResult:
         """Read the table again and adopt it between two datagrams; an invalid one changes nothing."""
@@ -269,19 +280,17 @@ class Router:
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
-    def _new_collector(self, program: Program) -> CountersCollector:
-        from router.observe.metrics import CountersCollector
+    def _current_readings(self) -> tuple[Program, Readings]:
+        if (made := self._readings) is None or made[0] is not self.program:
+            program = self.program
+            made = self._readings = (program, self._new_readings(program))
+        return made
 
-        build = {
-            "version": __version__,
-            "table_sha256": program.table.sha256,
-            "protos_sha256": program.protos_sha256,
-            "start": self._start,
-        }
+    def _new_readings(self, program: Program) -> Readings:
         # Use this program's counters: those of the running program are adopted only once no thread is stuck.
-        copies, now = partial(self._counts.copies, program.counters.size), boottime_ns()
+        totals, now = partial(self._counts.totals, program.counters.latest()), boottime_ns()
         self._known = {name: self._known.get(name, now) for name in program.table.endpoints}
-        return CountersCollector(program.counters, copies, self._computed_series(), self._known, build)
+        return Readings(program.counters, totals, self._computed_series(), self._known)
 
 
 class Services:

@@ -66,11 +66,13 @@ class Forwarding:
 
 
 def counts_and_events(library: ctypes.CDLL, counters: int) -> tuple[ctypes.Array[ctypes.c_int64], Ring]:
-    """Return counters and an event ring for a native thread. Raises MemoryError.
-
-    The counters never move, and use memory only where something is counted.
-    """
-    pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
-    counts = (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)
+    """Return counters and an event ring for a native thread. Raises MemoryError."""
+    counts = fresh_counts()
     counts[:counters] = [0] * counters  # no page fault in the thread
     return counts, Ring(library, _EVENTS)
+
+
+def fresh_counts() -> ctypes.Array[ctypes.c_int64]:
+    """Return counters that never move, and use memory only where something is counted. Raises MemoryError."""
+    pages = mmap(-1, MOST_COUNTERS * ctypes.sizeof(ctypes.c_int64), flags=MAP_PRIVATE)
+    return (ctypes.c_int64 * MOST_COUNTERS).from_buffer(pages)

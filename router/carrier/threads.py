@@ -29,11 +29,11 @@ class NativeThread:
         self._in_use = Lock()  # for callers while another thread may stop it
         self._address = 0
 
-    def counters(self, count: int) -> list[int]:
-        """Return the first `count` counters, as a snapshot between two messages."""
+    def counters(self, count: int) -> ctypes.Array[ctypes.c_int64]:
+        """Return a copy of the first `count` counters, as a snapshot between two messages."""
         with self._in_use:
             if self._copy is None or not self._address:
-                return self.counts[:count]
+                return (ctypes.c_int64 * count).from_buffer_copy(self.counts)
             copied = (ctypes.c_int64 * count)()
             self._copy(self._address, copied, count)
-        return list(copied)
+        return copied

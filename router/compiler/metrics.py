@@ -397,8 +397,9 @@ class Counters:
     the earlier program had are no longer current, but keep their indexes until `settle` frees them.
     """
 
-    _indexes: dict[tuple[str, ...], int] = field(default_factory=dict)  # the first index, by metric and labels
-    _current: set[tuple[str, ...]] = field(default_factory=set)
+    _indexes: dict[str, dict[tuple[str, ...], int]] = field(default_factory=dict)
+    """The first index of each series, by metric and labels."""
+    _current: set[Series] = field(default_factory=set)
     _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
     _commanded: dict[tuple[str, str], bool] = field(default_factory=dict)  # by route and target, also of earlier ones
@@ -406,7 +407,7 @@ class Counters:
     def continued(self) -> Counters:
         """Return counters for the next program, in which no series is current yet. These stay unchanged."""
         return Counters(
-            self._indexes.copy(),
+            {metric: indexes.copy() for metric, indexes in self._indexes.items()},
             set(),
             {length: starts.copy() for length, starts in self._free.items()},
             self._size,
@@ -420,24 +421,23 @@ class Counters:
     def are_commands(self, route: str, target: str) -> bool:
         return self._commanded.get((route, target), False)
 
-    def index(self, *series: str) -> int:
-        """Return the first index of a series, which is current from now on: `index(metric, *labels)`."""
-        self._current.add(series)
-        index = self._indexes.get(series)
-        return self._open(series) if index is None else index
+    def index(self, metric: str, *labels: str) -> int:
+        """Return the first index of a series, which is current from now on."""
+        self._current.add(Series(metric, labels))
+        index = self._indexes.get(metric, {}).get(labels)
+        return self._open(metric, labels) if index is None else index
 
-    def _open(self, series: tuple[str, ...]) -> int:
-        metric, *labels = series
+    def _open(self, metric: str, labels: tuple[str, ...]) -> int:
         declared = _BY_NAME[metric]
         if len(labels) != len(declared.labels):
-            raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
+            raise ValueError(f"{metric} has the labels {declared.labels}, not {list(labels)}")
         length = _length_of(declared)
         if free := self._free.get(length):
             start = free.pop()
         else:
             start = self._size
             self._size += length
-        self._indexes[series] = start
+        self._indexes.setdefault(metric, {})[labels] = start
         return start
 
     @property
@@ -447,26 +447,44 @@ class Counters:
 
     def series(self) -> Iterator[tuple[Series, int]]:
         """Yield every series with its first index, also those of earlier programs that have counted something."""
-        for (metric, *labels), index in self._indexes.items():
-            yield Series(metric, tuple(labels)), index
+        for metric in self._indexes:
+            for labels, index in self.series_of(metric):
+                yield Series(metric, labels), index
+
+    def series_of(self, metric: str) -> list[tuple[tuple[str, ...], int]]:
+        """Return the series of a metric: labels and first index. Thread-safe."""
+        return list(self._indexes.get(metric, {}).items())
+
+    def latest(self) -> bytes:
+        """Return a byte for each index: 0 if the counts of all threads add up, 1 if the largest one is the value."""
+        marks = bytearray(self._size)
+        for metric in METRICS:
+            if metric.kind not in _ADDED:
+                for _, index in self.series_of(metric.name):
+                    marks[index] = 1
+        return bytes(marks)
 
     def indexes(self) -> list[tuple[tuple[str, ...], int]]:
         """Return the first index of every series, by metric and labels. `Counters.of` makes equal counters."""
-        return [*self._indexes.items()]
+        return [((metric, *labels), index) for (metric, labels), index in self.series()]
 
     @classmethod
     def of(cls, indexes: Iterable[tuple[tuple[str, ...], int]], size: int) -> Counters:
         """Return counters with these indexes, none of which is current yet."""
-        return cls(dict(indexes), _size=size)
+        made: dict[str, dict[tuple[str, ...], int]] = {}
+        for (metric, *labels), index in indexes:
+            made.setdefault(metric, {})[tuple(labels)] = index
+        return cls(made, _size=size)
 
     def new_runs(self, earlier: Counters) -> Iterator[slice]:
         """Yield the indexes of each series that `earlier` lacks. These counters must continue `earlier`."""
-        for series in self._indexes.keys() - earlier._indexes.keys():
-            yield self._run(series)
+        for metric, indexes in self._indexes.items():
+            for labels in indexes.keys() - earlier._indexes.get(metric, {}).keys():
+                yield self._run(metric, labels)
 
-    def _run(self, series: tuple[str, ...]) -> slice:
-        start = self._indexes[series]
-        return slice(start, start + _length_of(_BY_NAME[series[0]]))
+    def _run(self, metric: str, labels: tuple[str, ...]) -> slice:
+        start = self._indexes[metric][labels]
+        return slice(start, start + _length_of(_BY_NAME[metric]))
 
     def fresh_counts(self) -> list[int]:
         """Return a list of zeros, one for each index, for one thread to own."""
@@ -484,20 +502,19 @@ class Counters:
         totals never decrease.
         """
         lists = list(threads)
-        left = self._indexes.copy()  # other threads may iterate over the present ones
-        for series in self._indexes.keys() - self._current:
-            run = self._run(series)
-            if _BY_NAME[series[0]].kind in _COUNTED and any(any(counts[run]) for counts in lists):
+        for metric, labels in [series for series, _ in self.series() if series not in self._current]:
+            run = self._run(metric, labels)
+            if _BY_NAME[metric].kind in _COUNTED and any(any(counts[run]) for counts in lists):
                 continue
             length = run.stop - run.start
             for counts in lists:
                 counts[run] = [0] * length
-            del left[series]
+            del self._indexes[metric][labels]
             self._free.setdefault(length, []).append(run.start)
-        self._indexes = left
 
 
 _COUNTED = ("counter", "histogram")
+_ADDED = (*_COUNTED, "level")
 
 
 def _length_of(metric: Metric) -> int:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from router.compiler.metrics import Mismatch
 from router.compiler.program import Program
 from router.errors import Diagnostic
 from router.observe.obedience import Replies
+from router.observe.snapshot import SERIES, Snapshot
 from router.recording.mirror import Mirror
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ class Running(Protocol):
 
     def collect(self) -> Iterator[Family]:
         """Return all metrics, for prometheus_client."""
+
+    def read(self, now: int, metrics: Collection[str] = SERIES) -> Snapshot:
+        """Return the values of these metrics at `now` (boot clock, ns)."""
 
     def mismatches(self) -> Mapping[Mismatch, int]:
         """Return messages from hosts that no route accepts them from, and their latest time (boot clock, ns)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -68,12 +68,10 @@ class Snapshot:
         return int(sum(value for rest, value in series.items() if rest[: len(others)] == tuple(others)))
 
 
-def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | None = None) -> Snapshot:
-    """Make a snapshot of the output of a collector or of the text format's parser. `metrics`: only these, if given."""
+def snapshot(families: Iterable[Family], at: float) -> Snapshot:
+    """Make a snapshot of the output of a collector or of the text format's parser."""
     values: dict[str, dict[Labels, float]] = defaultdict(dict)
     for family in families:
-        if metrics is not None and family.name.removeprefix(PREFIX) not in metrics:
-            continue
         for sample in family.samples:
             if (name := _EXPORTED.get(sample.name)) is not None:
                 labels = sample.labels

@@ -11,7 +11,7 @@ from router.compiler.program import Program
 from router.observe.last_values import LastValues
 from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
-from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
+from router.observe.snapshot import BUCKETS, SERIES, Snapshot
 from router.observe.watch import Health
 from router.table.model import Transport
 
@@ -72,15 +72,15 @@ class Status:
 
         `started` differs for each run of the router, since counters restart at zero.
         """
-        running = self._running
+        running, now = self._running, boottime_ns()
         program = running.program
-        table, at = program.table, boottime_ns() / 1e9
+        table = program.table
         return {
-            "at": at,
+            "at": now / 1e9,
             "started": self._started,
             "map": table.sha256,
             "ready": running.is_ready,
-            **numbers(snapshot(running.collect(), at)),
+            **numbers(running.read(now)),
             "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }

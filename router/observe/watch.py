@@ -11,7 +11,7 @@ from router.observe.bursts import Bursts
 from router.observe.health import PERIOD, WINDOW, HealthSnapshot
 from router.observe.problems import Kind
 from router.observe.running import Running
-from router.observe.snapshot import DELIVERED, Snapshot, snapshot
+from router.observe.snapshot import DELIVERED, Snapshot
 from router.threads import Thread, background_threads, join_or_abandon
 
 METRICS = {kind.metric for kind in Kind} | {
@@ -49,7 +49,7 @@ class Watch:
     def look(self, now: int) -> HealthSnapshot:
         """Return the state at `now` (boot clock, ns). One snapshot per PERIOD is kept for later calls."""
         with self._lock:
-            program, latest = self._running.program, snapshot(self._running.collect(), now / 1e9, METRICS)
+            program, latest = self._running.program, self._running.read(now, METRICS)
             self._tripped = {
                 route: found if (found := self._tripped.get(route, (-1, 0)))[0] == trips else (trips, now)
                 for (route,), trips in latest.counts("deadman_trips").items()

@@ -152,7 +152,7 @@ class ServingRos:
 
     def ledger(self) -> Ledger:
         size = max(index for _, index in self.program.counters.series()) + 1
-        return Ledger(self.program, self.thread.counters(size))
+        return Ledger(self.program, list(self.thread.counters(size)))
 
     def count(self, metric: str, *labels: str) -> int:
         return self.thread.counters(MOST_COUNTERS)[self.program.counters.index(metric, *labels)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from ipaddress import IPv4Network
@@ -23,7 +23,9 @@ from router.observe.health import HealthSnapshot
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.obedience import Reply
+from router.observe.readings import Readings
 from router.observe.running import ReloadResult
+from router.observe.snapshot import SERIES, Snapshot
 from router.observe.watch import Health, Watch
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored
 from router.table.addresses import Address
@@ -33,6 +35,10 @@ from tests.tables import ROUTES
 SPAN = SourceSpan("routes/sim.yaml", 8, 20, 34)
 LOOPBACK = Address("127.0.0.1", 0)
 RELOADED = ReloadResult(True, (), "nothing has changed")
+
+
+_LATER = [0] * 100
+"""What a reading has of series that a test opens after it."""
 
 
 @cache
@@ -89,13 +95,19 @@ class FakeRunning:
 
     def collect(self) -> Iterator[Family]:
         self.collected += 1
+        return CountersCollector(self._readings(), {"version": "1"}, self.clock_ns).collect()
+
+    def read(self, now: int, metrics: Collection[str] = SERIES) -> Snapshot:
+        self.collected += 1
+        return Snapshot(now / 1e9, self._readings().read(self.clock_ns(), metrics))
+
+    def _readings(self) -> Readings:
         computed = {
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         } | {"endpoint_stale_after_seconds": self._stale_after}
         counters, known = self.program.counters, dict.fromkeys(self.program.table.endpoints, self.began)
-        build = {"version": "1"}
-        return CountersCollector(counters, lambda: [self.counts], computed, known, build, self.clock_ns).collect()
+        return Readings(counters, lambda: [*self.counts, *_LATER], computed, known)
 
     def clock_ns(self) -> int:
         return boottime_ns()

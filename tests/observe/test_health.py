@@ -609,12 +609,12 @@ def test_what_fails_is_logged_once_and_tried_again(
     health = Health(router)
     tries, enough = iter(range(100_000)), threading.Event()
 
-    def collect() -> None:
+    def read(*_: object) -> None:
         if next(tries) == 3:
             enough.set()
         raise RuntimeError("no counters")
 
-    monkeypatch.setattr(router, "collect", collect)
+    monkeypatch.setattr(router, "read", read)
     assert enough.wait(10)
     health.close()
     assert capsys.readouterr().out.count("no counters") == 1

@@ -8,6 +8,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
+from ctypes import c_int64
 from dataclasses import dataclass
 from typing import cast
 
@@ -17,9 +18,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from router.clock import boottime_ns
 from router.compiler.metrics import LATENCY_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
+from router.library import library
 from router.net.doors import Door
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
+from router.observe.readings import Readings
 from router.observe.running import Running
 from router.observe.watch import Health
 from router.table.addresses import Address
@@ -80,6 +83,14 @@ class Scraped:
         return self.values()[name, frozenset(labels.items())]
 
 
+def joined(threads: list[list[int]], latest: bytes) -> list[int]:
+    """The counts of all threads together."""
+    totals = (c_int64 * len(latest))()
+    for counts in threads:
+        library().counters_join(totals, (c_int64 * len(latest))(*counts), latest, len(latest))
+    return list(totals)
+
+
 @pytest.fixture
 def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     monkeypatch.setattr("router.observe.responses.KEPT_SECONDS", 0)
@@ -91,7 +102,8 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     threads = [counters.fresh_counts(), counters.fresh_counts()]
     result = Scraped(indexes, threads, 0, LOOPBACK)
     computed = {"kernel_drops": lambda: [(["rover"], result.drops)]}
-    collector = CountersCollector(counters, lambda: threads, computed, {LABELS["endpoint"]: 0}, BUILD)
+    readings = Readings(counters, lambda: joined(threads, counters.latest()), computed, {LABELS["endpoint"]: 0})
+    collector = CountersCollector(readings, BUILD)
     with closing(
         HttpServer(LOOPBACK, SPAN, Door("http", (), Counter()), cast("Running", collector), NO_HEALTH, None)
     ) as server:
@@ -167,6 +179,6 @@ def test_the_process_and_what_it_runs_are_described_and_python_is_not(scraped: S
 def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
-        collector = CountersCollector(Counters(), lambda: [[]], {}, {}, BUILD)
+        collector = CountersCollector(Readings(Counters(), list, {}, {}), BUILD)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: cannot serve HTTP at {taken}: .*\(pid \d+\)"):
             HttpServer(taken, SPAN, Door("http", (), Counter()), cast("Running", collector), NO_HEALTH, None)

@@ -59,4 +59,7 @@ static inline bool counters_copy(edition *of, counter *counters, int64_t *to, ui
     return false;
 }
 
+/* Join the counters of a thread with the `totals` of others: their sum, or the larger one where `latest` is 1. */
+void counters_join(int64_t *totals, const int64_t *counters, const uint8_t *latest, uint32_t count);
+
 #endif
