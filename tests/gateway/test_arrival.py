@@ -119,6 +119,30 @@ class TestStreams:
                 assert events.arrivals[0] <= connected + 20_000_000  # the kernel's measure is that coarse
 
     @asynchronous
+    async def test_the_clock_rests_without_clients(self, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+        ticks: list[LoopClock] = []
+
+        def tick(clock: LoopClock) -> None:
+            ticks.append(clock)
+
+        monkeypatch.setattr(LoopClock, "tick", tick)
+        async with served(kind) as (transport, events):
+            await asyncio.sleep(3 * gateway_arrival.TICK_SECONDS)
+            assert ticks == []
+            one, other = await join(kind, transport), await join(kind, transport)
+            await until(lambda: len(events.clients) == 2 and ticks)
+            one.leave()
+            await until(lambda: len(events.clients) == 1)
+            before = len(ticks)
+            await until(lambda: len(ticks) > before)
+            other.leave()
+            await until(lambda: not events.clients)
+            await asyncio.sleep(gateway_arrival.TICK_SECONDS)
+            before = len(ticks)
+            await asyncio.sleep(3 * gateway_arrival.TICK_SECONDS)
+            assert len(ticks) == before
+
+    @asynchronous
     async def test_what_comes_while_the_loop_is_there_has_just_come(
         self, monkeypatch: pytest.MonkeyPatch, kind: str
     ) -> None:

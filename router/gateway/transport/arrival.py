@@ -21,7 +21,7 @@ CATCH_UP_NS = 100_000_000
 
 
 class LoopClock:
-    """Detects pauses of the event loop while started. `clock_ns` is the boot clock."""
+    """Detects pauses of the event loop while it has users. `clock_ns` is the boot clock."""
 
     def __init__(self, clock_ns: Callable[[], int] = boottime_ns) -> None:
         self._clock_ns = clock_ns
@@ -29,13 +29,19 @@ class LoopClock:
         self._left = 0
         self._caught_up = 0
         self._ticking: asyncio.TimerHandle | None = None
+        self._users = 0
 
-    def start(self) -> None:
-        self._last_tick = self._clock_ns()
-        self._tick_later()
+    def start(self, waited: int = 0) -> None:
+        """Add a user. `waited`: how long (ns) messages of the first one may already have been waiting."""
+        self._users += 1
+        if self._ticking is None:
+            self._last_tick = self._clock_ns() - waited
+            self._tick_later()
 
     def stop(self) -> None:
-        if self._ticking is not None:
+        """Remove a user."""
+        self._users -= 1
+        if not self._users and self._ticking is not None:
             self._ticking.cancel()
             self._ticking = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
@@ -36,6 +37,9 @@ MESSAGE_SECONDS = 10.0
 
 WATCH_SECONDS = 1.0
 """The interval of checks of that timeout."""
+
+_LAST_DATA_SENT = struct.Struct("44xI")
+"""The beginning of Linux's struct tcp_info, with tcpi_last_data_sent in ms."""
 
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before the loop continues with other work."""
@@ -127,6 +131,7 @@ class StreamClient:
         self._waiting = 0
         self._writing: asyncio.Handle | asyncio.Task[None] | None = None
         _configure(connection)
+        owner.clock.start(_age_ns(connection))  # it may have waited to be accepted, with messages
 
     def write(self, frames: Sequence[Frame]) -> None:
         self.push(self._owner.encode(frames))
@@ -149,9 +154,10 @@ class StreamClient:
         self._connection.abort()
 
     def has_left(self) -> None:
-        """Free what was not written, whatever still refers to the client."""
+        """Free what was not written, whatever still refers to the client. Called once."""
         self._pieces.clear()
         self._waiting = 0
+        self._owner.clock.stop()
 
     def _begin(self) -> None:
         """Write what has been pushed in this turn of the loop.
@@ -211,7 +217,6 @@ class StreamTransport(ABC):
 
     async def open(self) -> None:
         await self._binding.open()
-        self.clock.start()
         self._watch()
 
     async def close(self) -> None:
@@ -220,7 +225,6 @@ class StreamTransport(ABC):
         if self._watching is not None:
             self._watching.cancel()
         await self._stop()
-        self.clock.stop()
         self._log.flush(final=True)
         self._door.close()
 
@@ -290,6 +294,13 @@ class StreamTransport(ABC):
                 )
         self._log.flush()
         self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._watch)
+
+
+def _age_ns(connection: asyncio.Transport) -> int:
+    """Return how long ago a connection on which nothing has been sent was established."""
+    opened: socket.socket = connection.get_extra_info("socket")
+    info = opened.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_DATA_SENT.size)
+    return int(_LAST_DATA_SENT.unpack(info)[0]) * 1_000_000
 
 
 def _configure(connection: asyncio.Transport) -> None:
