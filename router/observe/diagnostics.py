@@ -6,8 +6,8 @@ import enum
 import platform
 import struct
 import threading
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from router.clock import wall_ns
@@ -90,6 +90,15 @@ class Report:
         self._health = health
         self._program = health.program
         self._host = platform.node()
+        self._by_first: dict[str, dict[str, list[tuple[Labels, int]]]] = {}
+        self._fresh = _sums(health.grown("messages_received"), 0)
+        self._received, self._sent = (
+            _sums(health.now.counts(metric).items(), 1) for metric in ("messages_received", "datagrams_sent")
+        )
+        self._dropped_for: dict[str, Counter[str]] = defaultdict(Counter)
+        for (_, target, reason), n in health.now.counts("messages_dropped").items():
+            if n:
+                self._dropped_for[target][reason] += int(n)
 
     def statuses(self) -> Iterator[Status]:
         """Yield all statuses, the router's own first."""
@@ -118,11 +127,10 @@ class Report:
         return _status("router", self._host, problems, "routing", values)
 
     def _listener(self, name: str) -> Status:
-        total = self._health.now.total
         values = [
             ("address", self._program.table.listeners[name].bound_to),
-            ("received", total("datagrams_received", name)),
-            ("dropped by the kernel", total("kernel_drops", name)),
+            ("received", self._total("datagrams_received", name)),
+            ("dropped by the kernel", self._total("kernel_drops", name)),
             *((f"rejected: {reason}", n) for (reason,), n in self._counted("datagrams_rejected", name)),
         ]
         return _status(
@@ -135,9 +143,9 @@ class Report:
             ("address", endpoint.address.value),
             ("kind", endpoint.kind.value),
             ("silent for", age_text(self._health.silence.get(name))),
-            ("received", self._of_endpoint("messages_received", name)),
-            ("sent", self._of_endpoint("datagrams_sent", name)),
-            *((f"dropped: {reason}", n) for reason, n in self._dropped_for(name)),
+            ("received", self._received[name]),
+            ("sent", self._sent[name]),
+            *((f"dropped: {reason}", n) for reason, n in self._dropped_for[name].items()),
         ]
         sends = any(source.value == name for route in routes for source in route.sources)
         well = (
@@ -150,11 +158,10 @@ class Report:
 
     def _route(self, route: Route) -> Status:
         name, health = route.name, self._health
-        received = health.now.total("messages_received", name)
-        fresh = sum(n for labels, n in health.grown("messages_received") if labels[0] == name)
+        received = self._total("messages_received", name)
         values = [
             ("received", received),
-            ("received per second", f"{fresh / health.seconds:.1f}"),
+            ("received per second", f"{self._fresh[name] / health.seconds:.1f}"),
             *((f"sent to {target}", n) for (target,), n in self._counted("datagrams_sent", name)),
             *((f"published on {topic}", n) for (topic,), n in self._counted("messages_published", name)),
             *((f"waiting for {target}", n) for (target,), n in self._counted("messages_waiting", name)),
@@ -167,9 +174,9 @@ class Report:
     def _gateway(self, gateway: GatewayPlan) -> Status:
         name = gateway.settings.name
         values = [
-            ("clients", self._health.now.total("gateway_clients", name)),
+            ("clients", self._total("gateway_clients", name)),
             *((f"topics {state}", n) for (state,), n in self._counted("gateway_topics", name)),
-            ("sent", self._health.now.total("messages_sent", name)),
+            ("sent", self._total("messages_sent", name)),
             *((f"received from {source}", n) for (source,), n in self._counted("messages_received", name)),
             *((f"rejected: {reason}", n) for (reason,), n in self._counted("datagrams_rejected", name)),
             *self._dropped(name),
@@ -187,25 +194,29 @@ class Report:
         for (target, reason), n in self._counted("messages_dropped", route):
             yield f"dropped for {target}: {reason}", n
 
-    def _dropped_for(self, endpoint: str) -> Iterator[tuple[str, int]]:
-        """Yield reasons and numbers of drops, summed over all routes."""
-        sums: Counter[str] = Counter()
-        for (_, target, reason), n in self._health.now.counts("messages_dropped").items():
-            if target == endpoint and n:
-                sums[reason] += int(n)
-        yield from sums.items()
+    def _counted(self, metric: str, first: str) -> Sequence[tuple[Labels, int]]:
+        """Return the series that are not 0, by their labels after the first."""
+        if metric not in self._by_first:
+            found = self._by_first[metric] = defaultdict(list)
+            for (of, *rest), value in self._health.now.counts(metric).items():
+                if value:
+                    found[of].append((tuple(rest), int(value)))
+        return self._by_first[metric][first]
 
-    def _of_endpoint(self, metric: str, endpoint: str) -> int:
-        """Return the sum over all routes of a metric whose second label is the endpoint."""
-        return int(sum(value for labels, value in self._health.now.counts(metric).items() if labels[1] == endpoint))
-
-    def _counted(self, metric: str, first: str) -> Iterator[tuple[Labels, int]]:
-        """Yield the series that are not 0, by their labels after the first."""
-        return ((rest, int(value)) for rest, value in self._health.now.of(metric, first).items() if value)
+    def _total(self, metric: str, first: str) -> int:
+        return sum(value for _, value in self._counted(metric, first))
 
 
 _TO_ENDPOINTS = ("endpoint", "target", "destination")
 """Labels that may name an endpoint."""
+
+
+def _sums(counts: Iterable[tuple[Labels, float]], label: int) -> Counter[str]:
+    """Return the sums of counts by the label at this position."""
+    sums: Counter[str] = Counter()
+    for labels, value in counts:
+        sums[labels[label]] += int(value)
+    return sums
 
 
 def _status(

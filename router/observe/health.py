@@ -7,7 +7,7 @@ Prometheus alerts are named after the kinds; tests compare words, levels and thr
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, pairwise
@@ -145,6 +145,7 @@ class HealthSnapshot:
     replies: Replies = field(default_factory=dict)
     bursts: Mapping[str, Burst] = field(default_factory=dict)
     returned: Mapping[str, float] = field(default_factory=dict)
+    _grown: dict[str, Collection[tuple[Labels, int]]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def now(self) -> Snapshot:
@@ -155,12 +156,13 @@ class HealthSnapshot:
         """The time from the first to the last snapshot."""
         return max(self.now.at - self.snapshots[0].at, 1e-9)
 
-    def grown(self, metric: str) -> Iterator[tuple[Labels, int]]:
-        """Yield the series that have grown since the first snapshot, and by how much."""
-        earlier = self.snapshots[0].counts(metric)
-        for labels, value in self.now.counts(metric).items():
-            if value > (before := earlier.get(labels, 0)):
-                yield labels, int(value - before)
+    def grown(self, metric: str) -> Collection[tuple[Labels, int]]:
+        """Return the series that have grown since the first snapshot, and by how much."""
+        if metric not in self._grown:
+            earlier, now = self.snapshots[0].counts(metric), self.now.counts(metric)
+            grown = ((labels, int(value - earlier.get(labels, 0))) for labels, value in now.items() if value)
+            self._grown[metric] = [(labels, more) for labels, more in grown if more > 0]
+        return self._grown[metric]
 
     @cached_property
     def silence(self) -> Mapping[str, float]:
@@ -361,7 +363,8 @@ class HealthSnapshot:
             if stalled > Kind.PUBLISH_STALLED.threshold:
                 yield self._problem(Kind.PUBLISH_STALLED, {"topic": topic[0]}, f" for {age_text(stalled)}")
         counts = [snapshot.counts(Kind.MESSAGES_WAITING.metric) for snapshot in self.snapshots]
-        waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in counts[-1])
+        now = [labels for labels, number in counts[-1].items() if number]
+        waiting = sum(min(each.get(labels, 0.0) for each in counts) for labels in now)
         if waiting > Kind.MESSAGES_WAITING.threshold:
             yield self._problem(Kind.MESSAGES_WAITING, {}, f", at least {waiting:.0f}")
 

@@ -80,7 +80,7 @@ class Reading(Mapping[str, Counts]):
         if name not in self._values:
             if name not in self._metrics:
                 raise KeyError(name)
-            self._values[name] = dict(self._buckets(name) if name.endswith(BUCKETS) else self._series(name))
+            self._values[name] = dict(self._buckets(name)) if name.endswith(BUCKETS) else self._series(name)
         return self._values[name]
 
     def histograms(self, metric: Metric) -> Iterator[Histogram]:
@@ -93,16 +93,15 @@ class Reading(Mapping[str, Counts]):
         for labels, bounds, counts, _ in self.histograms(metric_named(name.removesuffix(BUCKETS))):
             yield from (((*labels, bound), count) for bound, count in zip(bounds, counts, strict=True))
 
-    def _series(self, name: str) -> Iterator[tuple[Labels, float]]:
+    def _series(self, name: str) -> Counts:
         of, totals, now = self._source.counters.series_of, self._totals, self._now
         if name == "endpoint_unheard_seconds":
             unheard = (labels for labels, index in of("endpoint_silence_seconds") if not totals[index])
-            yield from ((labels, (now - self._source.known[labels[0]]) / 1e9) for labels in unheard)
-            return
+            return {labels: (now - self._source.known[labels[0]]) / 1e9 for labels in unheard}
         match metric_named(name).kind:
             case "age":
-                yield from ((labels, max(now - at, 0) / 1e9) for labels, index in of(name) if (at := totals[index]))
+                return {labels: max(now - at, 0) / 1e9 for labels, index in of(name) if (at := totals[index])}
             case "time":
-                yield from ((labels, totals[index] / 1e9) for labels, index in of(name))
+                return {labels: totals[index] / 1e9 for labels, index in of(name)}
             case _:
-                yield from ((labels, totals[index]) for labels, index in of(name))
+                return {labels: totals[index] for labels, index in of(name)}
