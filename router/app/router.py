@@ -43,6 +43,7 @@ if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time 
 
     from router.gateway.clients import ClientQueue
     from router.recording.recorder import Recorder
+    from router.ros.endpoints import Publication
 
 _TOTALS = (
     "datagrams_received",
@@ -209,7 +210,7 @@ class Router:
 
     def _open_services(self, change: Change, opening: ExitStack) -> None:
         diagnostics = change.ros.publications.get(DIAGNOSTICS) if change.ros else None
-        self._services.open(opening, (self._runtime.topics.node_name, diagnostics.publish) if diagnostics else None)
+        self._services.open(opening, self._runtime.topics.node_name, diagnostics)
         opening.callback(self.mirror.close)
 
     def _of_deadman(self, event: DeadmanEvents) -> None:
@@ -303,11 +304,8 @@ class Services:
         self._recorder: Recorder | None = None
         self._saving = DaemonThread("saving")
 
-    def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
-        """Open the services; `opening` closes them. Raises StartError.
-
-        `diagnostics`: the node's name and a function that publishes CDR bytes; None without diagnostics.
-        """
+    def open(self, opening: ExitStack, node: str, diagnostics: Publication | None) -> None:
+        """Open the services; `opening` closes them. Raises StartError. `node`: the node's name."""
         running, table = self._running, self._running.program.table
         if table.record is not None:
             from router.recording.recorder import Recorder
@@ -329,7 +327,8 @@ class Services:
         if diagnostics is not None:
             from router.observe.diagnostics import Diagnostics
 
-            opening.callback(Diagnostics(health, *diagnostics).close)
+            publish, wanted = diagnostics.publish, diagnostics.wanted
+            opening.callback(Diagnostics(health, node, publish, lambda: bool(wanted[0])).close)
         if table.http is not None:
             from router.observe.http import HttpServer
 

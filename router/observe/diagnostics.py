@@ -55,11 +55,14 @@ class Status(NamedTuple):
 class Diagnostics:
     """A thread that calls `publish` with the CDR bytes of a DiagnosticArray each PERIOD until it is closed."""
 
-    def __init__(self, source: Health, node: str, publish: Callable[[bytes], None]) -> None:
-        """`node` is the name of the router in each status."""
+    def __init__(
+        self, source: Health, node: str, publish: Callable[[bytes], None], is_wanted: Callable[[], bool]
+    ) -> None:
+        """`node` is the name of the router in each status. `is_wanted` returns whether anyone subscribes."""
         self._node = node
         self._health = source
         self._publish = publish
+        self._is_wanted = is_wanted
         self._stopping = threading.Event()
         self._thread = Thread(self._run, "diagnostics")
         with background_threads():
@@ -72,6 +75,8 @@ class Diagnostics:
     def _run(self) -> None:
         has_failed = False
         while not self._stopping.wait(PERIOD):
+            if not self._is_wanted():
+                continue
             try:
                 report = Report(self._health.look())
                 self._publish(diagnostic_array(wall_ns(), self._node, report.statuses()))

@@ -205,7 +205,7 @@ class Looked:
 
 def published(router: Counting, monkeypatch: pytest.MonkeyPatch, publish: Callable[[bytes], None]) -> Diagnostics:
     monkeypatch.setattr(diagnostics, "PERIOD", 0.01)
-    return Diagnostics(cast("Health", Looked(router)), "rover_router", publish)
+    return Diagnostics(cast("Health", Looked(router)), "rover_router", publish, lambda: True)
 
 
 def test_it_publishes_until_it_is_closed(router: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,6 +224,23 @@ def test_it_publishes_until_it_is_closed(router: Counting, monkeypatch: pytest.M
     message = deserialize_message(got[0], DiagnosticArray)
     assert message.status[0].name == "rover_router: router"
     assert len(got) == count
+
+
+def test_nothing_is_published_while_nobody_subscribes(router: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnostics, "PERIOD", 0.01)
+    turns, got, enough = iter(range(100_000)), list[bytes](), threading.Event()
+
+    def is_wanted() -> bool:
+        if next(turns) < 3:
+            assert not got
+            return False
+        enough.set()
+        return True
+
+    thread = Diagnostics(cast("Health", Looked(router)), "rover_router", got.append, is_wanted)
+    assert enough.wait(10)
+    thread.close()
+    assert got
 
 
 def test_what_cannot_be_published_is_told_once_and_tried_again(
