@@ -1,8 +1,9 @@
-"""Events of publishers and subscriptions (new subscribers, incompatible peers), and the thread that waits for them."""
+"""Events of publishers and subscriptions (new subscribers, incompatible peers), and the threads that wait for them."""
 
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -14,7 +15,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_policy_name_from_kind
 
-from router.clock import monotonic_ns
 from router.compiler.metrics import QOS_POLICIES
 from router.compiler.program import TopicPlan
 from router.log import fault, logger
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 CHECK_INTERVAL_NS = 1_000_000_000
 """The longest delay of changes that are polled: events of subscriptions, incompatible peers that leave, and a shutdown
 of ROS from outside."""
+
+FOREVER = -1
 
 Incompatible = Callable[[str, str, int], None]
 """Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and the number of peers that mismatch."""
@@ -43,7 +45,7 @@ WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
 
 
 class PeerEvents:
-    """Event callbacks of publishers and subscriptions about their peers. For one thread.
+    """Event callbacks of publishers and subscriptions about their peers, to be called one at a time.
 
     `subscriber_joined(topic)` is called for each new subscriber.
     """
@@ -135,7 +137,10 @@ class WaitSet:
         self._set = rclpy_implementation.WaitSet(0, 1, 0, 0, 0, len(events), node.context.handle)
 
     def wait(self, timeout_ns: int) -> None:
-        """Wait until an event happens or `wake` is called, at most `timeout_ns`. No signal handler runs meanwhile."""
+        """Wait until an event happens or `wake` is called, at most `timeout_ns` or FOREVER.
+
+        No signal handler runs meanwhile.
+        """
         waiting = self._set
         waiting.clear_entities()  # waiting removes the entities that are not ready
         waiting.add_guard_condition(self._guard_condition.handle)
@@ -159,11 +164,12 @@ class WaitSet:
 
 
 class EventThread:
-    """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
+    """Calls the callbacks of events, one at a time: those of publishers when they happen, others at most 1 s later.
 
-    Events of subscriptions are polled, because in Fast DDS every message ends a wait for them, and an untaken one
-    ends it at once: this thread would compete with the receiving one for the interpreter. Events have their own thread
-    because they need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
+    The thread `ros events` waits for those of publishers without a timeout, because each wait for 900 topics takes
+    10 ms. `ros checks` polls those of subscriptions: in Fast DDS every message ends a wait for them, and an untaken one
+    ends it at once, so a waiting thread would compete with the receiving one for the interpreter. They start once and
+    stop once.
     """
 
     def __init__(
@@ -178,32 +184,35 @@ class EventThread:
         self._polled = WaitSet(node, of_subscriptions)
         self._context = node.context
         self._check = check
-        self._stopping = False
-        self._thread = Thread(self._run, "ros events")
+        self._calling = threading.Lock()
+        self._stopping = threading.Event()
+        self._threads = Thread(self._wait, "ros events"), Thread(self._poll, "ros checks")
 
     def start(self) -> None:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
-        self._stopping = True
+        self._stopping.set()
         self._waited_for.wake()
-        if join_or_abandon(self._thread):
+        have_ended = [join_or_abandon(thread) for thread in self._threads]
+        if all(have_ended):
             self._waited_for.close()
             self._polled.close()
 
-    def _run(self) -> None:
-        check_at = 0
-        while not self._stopping:
-            self._waited_for.wait(max(0, check_at - monotonic_ns()))
-            if not self._context.ok():
-                logger.critical("ROS was shut down from outside the router: restart the router to publish again")
-                return
+    def _wait(self) -> None:
+        while not self._stopping.is_set():
+            self._waited_for.wait(FOREVER)
             self._serve(self._waited_for)
-            if (now := monotonic_ns()) >= check_at:
-                check_at = now + CHECK_INTERVAL_NS
-                self._polled.wait(0)
-                self._serve(self._polled)
-                self._call(self._check)
+
+    def _poll(self) -> None:
+        while self._context.ok():
+            self._polled.wait(0)
+            self._serve(self._polled)
+            self._call(self._check)
+            if self._stopping.wait(CHECK_INTERVAL_NS / 1e9):
+                return
+        logger.critical("ROS was shut down from outside the router: restart the router to publish again")
 
     def _serve(self, wait_set: WaitSet) -> None:
         for event, status in wait_set.happened():
@@ -211,6 +220,7 @@ class EventThread:
 
     def _call(self, callback: Callable[[], None]) -> None:
         try:
-            callback()
+            with self._calling:
+                callback()
         except Exception as error:  # noqa: BLE001 a bug is logged; later events are still handled
             fault(error, "lost an event").log()

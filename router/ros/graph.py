@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from ctypes import c_int, c_void_p
 from dataclasses import dataclass, field, replace
 from time import sleep
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from router.compiler.topics import resolved
 from router.log import logger
 from router.ros.marks import Router, marks, this_router
 from router.ros.node import close_node, open_node
+from router.ros.rcl import function
 
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """The name in the graph until the node of a publisher or subscriber has been discovered."""
@@ -112,15 +114,49 @@ def look_once(tool: str, program: Program, seconds: float) -> Surroundings:
         close_node(node)
 
 
+class GraphChanges:
+    """Tells whether the graph has changed. For one thread."""
+
+    def __init__(self, node: Node) -> None:
+        self._set = rclpy_implementation.WaitSet(0, 1, 0, 0, 0, 0, node.context.handle)
+        with node.handle:
+            self._changed = _graph_guard_condition(node.handle.pointer)
+
+    def seen(self) -> bool:
+        """Return whether the graph has changed since the last call."""
+        self._set.clear_entities()
+        if _add_guard_condition(self._set.pointer, self._changed, None):
+            return True
+        self._set.wait(0)
+        return bool(self._set.is_ready("guard_condition", 0))
+
+    def close(self) -> None:
+        self._set.destroy_when_not_in_use()
+
+
+_graph_guard_condition = function("rcl_node_get_graph_guard_condition", c_void_p, c_void_p)
+_add_guard_condition = function("rcl_wait_set_add_guard_condition", c_int, c_void_p, c_void_p, c_void_p)
+
+
 class GraphWatch:
     """Looks at the graph, and logs what is new there. For one thread; others may read `now`."""
 
     def __init__(self, node: Node) -> None:
         self.now = Surroundings()
         self._node = node
+        self._changes = GraphChanges(node)
+        self._ours: Ours | None = None
         self._namesakes = 0
 
+    def close(self) -> None:
+        self._changes.close()
+
     def check(self, ours: Ours) -> None:
+        """Look at the graph if it, or `ours`, has changed, or if anything was found there."""
+        has_changed = self._changes.seen() or ours is not self._ours
+        if not has_changed and not self._namesakes and self.now == Surroundings():
+            return
+        self._ours = ours
         latest = look(self._node, ours)
         # A node and its topics are discovered one after the other.
         namesakes, self._namesakes = min(latest.namesakes, self._namesakes), latest.namesakes

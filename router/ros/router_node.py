@@ -61,6 +61,7 @@ class RouterNode:
             self.name = self._full_name.removeprefix("/")
             opening.callback(Mark(self._node, self._full_name).close)
             self._graph = GraphWatch(self._node)
+            opening.callback(self._graph.close)
             self.topics = RosTopics(self._node, self._types)
             opening.callback(self._close_topics)
             change = self.prepare(publishers, subscriptions, spans)

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from time import sleep
+from typing import Any
 
 import pytest
 
@@ -16,7 +18,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from structlog.testing import capture_logs
 
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
-from router.ros import events
+from router.ros import events, graph
 from router.ros.graph import Mistyped, Surroundings, look
 from router.ros.marks import marks, this_router
 from router.ros.node import close_node, open_node
@@ -116,6 +118,31 @@ def test_a_router_that_was_killed_does_not_count_while_dds_remembers_it() -> Non
         remembered = [router.process for _, router in marks(ros.topics.names())]
         assert remembered.count(other.process.pid) == 2
         assert look(ros._node, ros._ours) == Surroundings()
+
+
+def test_a_graph_that_does_not_change_is_not_queried_again(
+    monkeypatch: pytest.MonkeyPatch, opened: Callable[..., RosProcess]
+) -> None:
+    looks: list[Surroundings] = []
+
+    def counted_look(*arguments: Any) -> Surroundings:
+        looks.append(look(*arguments))
+        return looks[-1]
+
+    monkeypatch.setattr(graph, "look", counted_look)
+    with closing(open_ros(subscriptions=[string_topic()])) as ros:
+        wait_until(lambda: bool(looks))
+
+        def rests() -> bool:
+            before = len(looks)
+            sleep(10 * events.CHECK_INTERVAL_NS / 1e9)
+            return len(looks) == before
+
+        wait_until(rests)
+        opened(Publisher, "greeting", INT32)
+        wait_until(lambda: len(counted(ros)) == 1)
+        before = len(looks)
+        wait_until(lambda: len(looks) > before + 2)  # until the publisher has gone
 
 
 def test_a_node_with_the_name_of_the_router_counts_if_it_is_no_router() -> None:
