@@ -40,9 +40,7 @@ class Size(NamedTuple):
         return PROGRAMS / f"routes_{self.routes}_{self.topics}{'' if self.http else '_alone'}"
 
 
-SMALL, LARGE = Size(26), Size(260)
-LARGEST = Size(1000, topics=1)
-"""With two topics each it would have too many values."""
+SMALL, LARGE, LARGEST = Size(26), Size(260), Size(1000, topics=1)
 MANY, MOST, ALL_PUBLISHED = Size(1000, topics=0), Size(2500, topics=0), Size(900, topics=1, http=False)
 """Sizes for idling."""
 SIZES = (SMALL, LARGE, LARGEST, MANY, MOST, ALL_PUBLISHED)

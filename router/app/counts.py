@@ -8,10 +8,9 @@ from functools import partial
 from typing import cast
 
 from router.app.change import Change
-from router.carrier.forwarding import MOST_COUNTERS, fresh_counts
+from router.carrier.forwarding import fresh_counts
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Counters
-from router.errors import ConfigurationError
 from router.library import library
 
 
@@ -34,9 +33,7 @@ class ThreadCounts:
         """Include the counts of a native thread, in consistent copies."""
         self._add(thread.counts, thread.counters)
 
-    def _add(
-        self, counts: ctypes.Array[ctypes.c_int64], copy: Callable[[int], ctypes.Array[ctypes.c_int64]]
-    ) -> None:
+    def _add(self, counts: ctypes.Array[ctypes.c_int64], copy: Callable[[int], ctypes.Array[ctypes.c_int64]]) -> None:
         self.lists.append(cast("list[int]", counts))  # it is only indexed and sliced
         self._copies.append(copy)
 
@@ -59,12 +56,8 @@ class ThreadCounts:
     # adoption of another program
 
     def prepare(self, change: Change) -> None:
-        """Make room for its counts. Raises ConfigurationError."""
+        """Make room for its counts."""
         counters = change.program.counters
-        if counters.size > MOST_COUNTERS:
-            raise ConfigurationError(
-                f"the table has {counters.size} counters, but there is room for only {MOST_COUNTERS}"
-            )
         new = list(counters.new_runs(self.counters))
         for counts in self.lists:
             for run in new:  # a program that was abandoned may have counted there

@@ -10,6 +10,7 @@ from router.carrier.forwarding_threads import ForwardingThreads
 from router.carrier.loading import LoadedImage
 from router.carrier.owned import open_native
 from router.carrier.ring import Ring
+from router.declared import MOST_COUNTERS
 from router.image.names import Names
 
 TYPE_CHECKING = False
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 
     from router.carrier.loading import Addressed
     from router.image.image import Image
-
-MOST_COUNTERS = 1 << 18
-"""Counters of each native thread: a fixed number, because their addresses must not change."""
 
 FIRST_GENERATION = 1
 """The generation of a stored image; compiled ones have higher generations."""

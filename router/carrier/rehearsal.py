@@ -13,14 +13,12 @@ from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Ret
 from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.compiler.program import Program
-from router.declared import RecordKind
+from router.declared import MOST_COUNTERS, RecordKind
 from router.image.image import Image
 from router.image.names import Names
 from router.image.writer import write_image
 
 Peer = tuple[str, int]
-
-_MOST_COUNTERS = 1 << 18
 
 
 class Time(NamedTuple):
@@ -170,7 +168,7 @@ class _Opened:
 
     def __init__(self, library: ctypes.CDLL, now: int) -> None:
         self.library = library
-        self.counters = (ctypes.c_int64 * _MOST_COUNTERS)()
+        self.counters = (ctypes.c_int64 * MOST_COUNTERS)()
         self.running: _Running | None = None
         self._senders: dict[tuple[str, Peer], _Sender] = {}
         self._open(now)

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from router.declared import HISTOGRAM_BOUNDS
+from router.declared import HISTOGRAM_BOUNDS, MOST_COUNTERS
+from router.errors import ConfigurationError
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,6 +438,10 @@ class Counters:
         else:
             start = self._size
             self._size += length
+            if self._size > MOST_COUNTERS:
+                raise ConfigurationError(
+                    f"the table needs more than {MOST_COUNTERS} counters", "split it: run two routers"
+                )
         self._indexes.setdefault(metric, {})[labels] = start
         return start
 

@@ -24,9 +24,7 @@ _EXPORTED_AS = {"time": "gauge", "age": "gauge", "number": "gauge", "level": "ga
 class CountersCollector(Collector):
     """Exports all series from the first scrape on, even at 0. `build`: labels of `router_build_info`."""
 
-    def __init__(
-        self, readings: Readings, build: Mapping[str, str], clock_ns: Callable[[], int] = boottime_ns
-    ) -> None:
+    def __init__(self, readings: Readings, build: Mapping[str, str], clock_ns: Callable[[], int] = boottime_ns) -> None:
         self._readings = readings
         self._build = build
         self._clock_ns = clock_ns

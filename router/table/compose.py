@@ -31,7 +31,8 @@ from router.table.nodes import (
 from router.table.source import Source, fill, foreign_blank, has_variables, unusable_character
 
 MAX_DEPTH = 32
-MAX_NODES = 20_000
+MOST_REPEATED = 20_000
+"""Values that all aliases of a file repeat: a few lines of nested ones can stand for billions."""
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's if this PyYAML was built with it
 
@@ -59,6 +60,7 @@ class _Composer:
         self._findings = findings
         self._open: list[_Collection] = []
         self._anchors: dict[str, tuple[Node, int]] = {}
+        self._repeated = 0
         self._root: Node | None = None
 
     def compose(self) -> Node:
@@ -121,6 +123,9 @@ class _Composer:
                 self._span(event), what, "write out the value" if recursive else self._anchor_hint(event.anchor or "")
             )
         node, size = self._anchors[event.anchor]
+        self._repeated += size
+        if self._repeated > MOST_REPEATED:
+            raise self._fatal(self._span(event), f"aliases repeat more than {MOST_REPEATED} values of this file", "")
         self._add(node, size, None)
 
     def _anchor_hint(self, name: str) -> str:
@@ -139,8 +144,6 @@ class _Composer:
         parent = self._open[-1]
         parent.children.append(node)
         parent.size += size
-        if parent.size > MAX_NODES:
-            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, counting aliases in full", "")
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)

@@ -18,8 +18,9 @@ from grpc_tools import _protoc_compiler
 
 from router.app import Router
 from router.app.memory import Mapping, read_only
-from router.carrier.forwarding import MOST_COUNTERS, counts_and_events
+from router.carrier.forwarding import counts_and_events
 from router.carrier.ring import Ring
+from router.declared import MOST_COUNTERS
 from router.library import load
 from tests.app.conftest import Site
 from tests.ports import free_port

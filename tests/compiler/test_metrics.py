@@ -15,6 +15,7 @@ from router.compiler.metrics import (
     metric,
 )
 from router.compiler.program import Program
+from router.errors import ConfigurationError
 
 
 def test_asking_twice_gives_the_same_slot() -> None:
@@ -34,6 +35,15 @@ def test_histogram_takes_a_run_of_slots() -> None:
 def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:
     with pytest.raises(ValueError, match="labels"):
         Counters().index("datagrams_rejected", "a")
+
+
+def test_more_counters_than_there_is_room_for_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("router.compiler.metrics.MOST_COUNTERS", 2)
+    counters = Counters()
+    counters.index("datagrams_rejected", "a", "empty")
+    counters.index("datagrams_rejected", "b", "empty")
+    with pytest.raises(ConfigurationError, match="more than 2 counters"):
+        counters.index("datagrams_rejected", "c", "empty")
 
 
 def test_metric_names_are_unique() -> None:

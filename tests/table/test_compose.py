@@ -170,6 +170,12 @@ def test_an_alias_bomb_is_one_finding(tmp_path: Path) -> None:
     assert "more than 20000 values" in finding.message
 
 
+def test_as_many_values_as_are_written_are_read(tmp_path: Path) -> None:
+    root, findings = composed(tmp_path, f"&x a: [{'x, ' * 30_000}*x]")
+    assert isinstance(root, MappingNode)
+    assert findings == []
+
+
 @pytest.mark.parametrize(
     ("text", "value"),
     [

@@ -9,6 +9,9 @@
 
 typedef _Atomic int64_t counter;
 
+/* Counters of each thread: a fixed number, because their addresses must not change. A table cannot have more. */
+enum { MOST_COUNTERS = 1 << 19 };
+
 /* Add to a counter. Each array of counters has one writing thread, or one lock that its writers hold. */
 static inline void counter_add(counter *counters, uint32_t index, int64_t amount) {
     int64_t now = atomic_load_explicit(&counters[index], memory_order_relaxed);
