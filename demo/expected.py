@@ -8,7 +8,10 @@ from router.compiler.check import check_table
 from router.compiler.topics import resolved
 from router.errors import TableError
 from router.table.addresses import Address
-from router.table.model import EndpointKind, GatewayFormat, Route, RouteTable, Transport
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.gateways import GatewayFormat, Transport
+from router.table.model.routes import Route
 
 COMMANDED, LOST, FOUND = 3.0, 5.0, 8.0
 """Seconds on the simulator's clock: the end of the software's commands to boards, then the loss and the return of the

@@ -10,7 +10,8 @@ import subprocess
 
 from router.errors import UsageError
 from router.table.addresses import Address
-from router.table.model import RouteTable, Transport
+from router.table.model import RouteTable
+from router.table.model.gateways import Transport
 from router.tools.udp import open_udp
 
 DOMAINS = range(1, 102)

@@ -11,7 +11,9 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.rehearsal.rehearsal import Dropped, Published, Rehearsal
-from router.table.model import Route, RouteTable, Transport
+from router.table.model import RouteTable
+from router.table.model.gateways import Transport
+from router.table.model.routes import Route
 from tests.small_tables import SENSOR_BOARD
 from tests.tables import ROUTES
 

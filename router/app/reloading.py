@@ -20,7 +20,8 @@ from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, pl
 from router.log import fault, logger
 from router.observe.running import ReloadResult
 from router.table.keys import are_same
-from router.table.model import NodeSettings, RouteTable
+from router.table.model import RouteTable
+from router.table.model.settings import NodeSettings
 from router.threads import StuckError, background_threads
 
 _MOST_NAMED = 12

@@ -35,7 +35,7 @@ from router.observe.snapshot import SERIES, Snapshot
 from router.recording.mirror import Mirror
 from router.startup_image.head_start import HeadStart
 from router.table.addresses import Address
-from router.table.model import HOW_TO_KEEP
+from router.table.model.settings import HOW_TO_KEEP
 from router.threads import DaemonThread, StopStack, background_threads
 
 if TYPE_CHECKING:  # importing prometheus_client would take a tenth of the time until the ports are bound

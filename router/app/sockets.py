@@ -16,8 +16,8 @@ from router.log import logger
 from router.net.sockets import ListeningSocket, placed
 from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
 from router.startup_image.head_start import HeadStart
-from router.table import model
 from router.table.addresses import BadAddressError
+from router.table.model import endpoints
 
 
 @dataclass(slots=True)
@@ -36,14 +36,14 @@ class SocketChange:
     unused: ExitStack = field(default_factory=ExitStack)
 
 
-def _log_absence(listener: model.Listener) -> None:
+def _log_absence(listener: endpoints.Listener) -> None:
     host = listener.address.value._replace(port=0)  # the port may be taken, by an inherited socket
     why, remedy = absence(host, listener.interface) or ("its network is gone", "")
     what = "this listener receives nothing until its network is up; the others work"
     logger.warning(what, listener=listener.name, address=listener.bound_to, why=why, remedy=remedy)
 
 
-def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
+def _check_reachable(endpoint: endpoints.Endpoint, is_new: bool) -> None:
     """Log why nothing can be sent to an endpoint now. Raises ConfigurationError for a broadcast address."""
     address = endpoint.address.value
     try:
@@ -58,7 +58,7 @@ def _check_reachable(endpoint: model.Endpoint, is_new: bool) -> None:
         logger.warning(what, endpoint=endpoint.name, address=str(address), why=why, remedy=remedy)
 
 
-def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
+def _check_source(endpoint: endpoints.Endpoint, sender: NativeSender) -> None:
     """Warn if datagrams leave with a source address other than that of the route to the endpoint."""
     own, usual = sender.leaves_from, usual_source(endpoint.address.value)
     if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
@@ -72,9 +72,9 @@ def _check_source(endpoint: model.Endpoint, sender: NativeSender) -> None:
     )
 
 
-def _destination(endpoint: model.Endpoint) -> object:
+def _destination(endpoint: endpoints.Endpoint) -> object:
     """Return the settings of an endpoint that its sender depends on."""
-    return tuple(endpoint.address.value), endpoint.kind is model.EndpointKind.BOARD
+    return tuple(endpoint.address.value), endpoint.kind is endpoints.EndpointKind.BOARD
 
 
 class KernelDrops:
@@ -148,7 +148,7 @@ class Sockets:
             left += [each for each in self._inherited if each not in used]
             change.sockets = SocketChange(listeners, senders, moves, left, opening.pop_all())
 
-    def _listener(self, plan: model.Listener, opening: ExitStack) -> Listener:
+    def _listener(self, plan: endpoints.Listener, opening: ExitStack) -> Listener:
         """Return the open listener of a plan, or open it."""
         listener = self._bound.get(plan.bound_to)
         if listener is None or listener.is_replaceable():

@@ -9,7 +9,7 @@ from router import datagrams
 from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute
 from router.compiler.program import Program
 from router.declared import DropReason, Reason
-from router.table.model import Framing
+from router.table.model.endpoints import Framing
 
 REJECTIONS = tuple(reason.name.lower() for reason in Reason)
 """The names of `metrics.REJECT_REASONS`, by `enum reason`."""

@@ -53,7 +53,7 @@ def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
 
 def senders(args: argparse.Namespace, _: str = "") -> Iterator[str]:
     """Yield the endpoints that may send messages."""
-    from router.table.model import EndpointKind
+    from router.table.model.endpoints import EndpointKind
 
     if table := _table(args):
         yield from (endpoint.name for endpoint in table.endpoints.values() if endpoint.kind is not EndpointKind.TOOL)

@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _listen_to_gateway(args: argparse.Namespace) -> None:
-    from router.table.model import GatewayFormat
+    from router.table.model.gateways import GatewayFormat
     from router.tools.gateway_client import GatewayClient, Message, topic_filter
     from router.tools.gateway_sources import open_source
     from router.tools.udp import destination

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from router.compiler.program import Program
     from router.startup_image.head_start import HeadStartAttempt
     from router.table.addresses import Address
-    from router.table.model import Gateway
+    from router.table.model.gateways import Gateway
 
 _DESCRIPTION = f"""Run a route table until SIGINT or SIGTERM. SIGHUP reloads the table (see 'router reload'). SIGUSR1
 saves the last datagrams, if the table keeps them ('record').
@@ -168,7 +168,7 @@ def _places(router: Router, reachable: Callable[[Address], Address]) -> Iterator
 
 
 def _place(gateway: Gateway, reachable: Callable[[Address], Address]) -> str:
-    from router.table.model import Transport
+    from router.table.model.gateways import Transport
 
     if gateway.zenoh is not None:
         return f"zenoh://{gateway.zenoh.key.value}"

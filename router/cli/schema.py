@@ -21,7 +21,7 @@ from router.errors import Located, SourceSpan, TableError, UsageError, did_you_m
 from router.types.lock_file import ENVELOPE, ONEOF, short_name
 
 if TYPE_CHECKING:
-    from router.table.model import EnvelopeSettings
+    from router.table.model.settings import EnvelopeSettings
     from router.types.lock import Conflict
     from router.types.lock_file import Lock
 
@@ -91,7 +91,7 @@ def _settings(args: argparse.Namespace) -> EnvelopeSettings:
 
 
 def _of_folder(root: Path) -> EnvelopeSettings:
-    from router.table.model import EnvelopeSettings
+    from router.table.model.settings import EnvelopeSettings
 
     span = SourceSpan(shown_path(root))
     return EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))

@@ -10,7 +10,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from router.compiler.checked import CheckedRoute
 from router.compiler.topics import qos_of, resolved
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import Deadman, EndpointKind, Route, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.routes import Deadman, Route
+from router.table.model.targets import Topic
 from router.table.units import duration
 
 USUAL_TTL = 200_000_000

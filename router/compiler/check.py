@@ -24,7 +24,9 @@ from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Code, Diagnostic, Severity, TableError
 from router.table import in_order, load_table
-from router.table.model import EndpointKind, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.targets import Topic
 from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, places
 from router.types.lock import LockComparison
 from router.types.model import MessageType

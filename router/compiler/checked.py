@@ -9,7 +9,9 @@ from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan, ObeyedPlan
 from router.errors import SourceSpan
-from router.table.model import Destination, Endpoint, EndpointKind, OnLimit, Priority, Route, Topic
+from router.table.model.endpoints import Endpoint, EndpointKind
+from router.table.model.routes import Route
+from router.table.model.targets import Destination, OnLimit, Priority, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 

@@ -17,15 +17,10 @@ from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.declared import MOST_DESTINATIONS
 from router.errors import Code, Diagnostic, FindingError, Located, SourceSpan
-from router.table.model import (
-    DEFAULT_REPEAT,
-    Deadman,
-    FieldMap,
-    InboundDeadman,
-    OnLimit,
-    Payload,
-    Route,
-)
+from router.table.model.expressions import FieldMap
+from router.table.model.gateways import InboundDeadman
+from router.table.model.routes import DEFAULT_REPEAT, Deadman, Payload, Route
+from router.table.model.targets import OnLimit
 from router.table.units import duration
 from router.types.board_limits import scalars
 from router.types.framing import trimmed

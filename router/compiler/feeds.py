@@ -10,7 +10,9 @@ from router.compiler.constants import envelope_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.errors import Code, FindingError, did_you_mean
-from router.table.model import Deadman, Destination, FieldMap, Route
+from router.table.model.expressions import FieldMap
+from router.table.model.routes import Deadman, Route
+from router.table.model.targets import Destination
 from router.types.model import MessageType
 
 _NOTHING = MessageType("nothing")

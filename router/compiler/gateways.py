@@ -14,7 +14,8 @@ from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.selection import pattern_problem
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, FindingError
-from router.table.model import Gateway, Inbound, RouteTable
+from router.table.model import RouteTable
+from router.table.model.gateways import Gateway, Inbound
 from router.types.model import MessageType
 
 

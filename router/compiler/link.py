@@ -14,7 +14,9 @@ from router.compiler.metrics import Counters
 from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
 from router.compiler.series import open_series
 from router.compiler.topics import qos_of
-from router.table.model import ANY, Route, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.routes import ANY, Route
+from router.table.model.targets import Topic
 from router.types.model import MessageType
 
 if TYPE_CHECKING:

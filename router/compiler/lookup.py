@@ -16,7 +16,12 @@ from router.compiler.expressions.operators import presence_hint
 from router.compiler.expressions.tree import Node
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, one_of
-from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, Route, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, EndpointKind
+from router.table.model.expressions import Expression
+from router.table.model.routes import ANY, ROS, Route
+from router.table.model.settings import EnvelopeSettings
+from router.table.model.targets import Topic
 from router.types.board_limits import BoardLimits
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type

@@ -16,7 +16,7 @@ from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.tree import Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest, one_of
-from router.table.model import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TEXT
 from router.types.model import Field, List, MessageType, String, Type
 from router.types.paths import ways

@@ -9,7 +9,10 @@ from itertools import combinations
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
 from router.table.addresses import Address
-from router.table.model import ANY, EPHEMERAL, Endpoint, EndpointKind, Gateway, RouteTable, Transport
+from router.table.model import RouteTable
+from router.table.model.endpoints import EPHEMERAL, Endpoint, EndpointKind
+from router.table.model.gateways import Gateway, Transport
+from router.table.model.routes import ANY
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."

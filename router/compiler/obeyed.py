@@ -11,7 +11,7 @@ from router.compiler.expressions.tree import Node, Present, Read, parts_of
 from router.compiler.lookup import Lookup
 from router.compiler.program import ObeyedPlan
 from router.errors import Code, Located
-from router.table.model import ANY, Deadman, Obeyed, Route
+from router.table.model.routes import ANY, Deadman, Obeyed, Route
 from router.table.units import duration
 
 LONGEST_WITHIN = 30 * NS_PER_SECOND

@@ -8,7 +8,10 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import Counters
-from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, Listener
+from router.table.model.gateways import Gateway, Inbound
+from router.table.model.targets import OnLimit, Priority
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema

@@ -19,16 +19,11 @@ from router.compiler.obeyed import check_obeyed
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
-from router.table.model import (
-    ANY,
-    Collect,
-    Destination,
-    Endpoint,
-    Expression,
-    Route,
-    RouteTable,
-    Topic,
-)
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint
+from router.table.model.expressions import Expression
+from router.table.model.routes import ANY, Collect, Route
+from router.table.model.targets import Destination, Topic
 from router.types.model import List, MessageType
 from router.types.protobuf import PayloadCase
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from functools import lru_cache
 from typing import NamedTuple
 
-from router.table.model import Gateway, TopicPattern, TopicRate
+from router.table.model.gateways import Gateway, TopicPattern, TopicRate
 
 _WILDCARDS = re.compile(r"[*?]")
 _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")

@@ -22,7 +22,8 @@ from router.compiler.metrics import (
     Counters,
 )
 from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, source_label
-from router.table.model import ROS, RouteTable
+from router.table.model import RouteTable
+from router.table.model.routes import ROS
 from router.types.protobuf import Envelope
 
 

@@ -10,7 +10,12 @@ from itertools import product
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.keys import keys_of
-from router.table.model import EndpointKind, InboundDeadman, NodeSettings, OnLimit, Qos, Route, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.gateways import InboundDeadman
+from router.table.model.routes import Route
+from router.table.model.settings import NodeSettings
+from router.table.model.targets import OnLimit, Qos, Topic
 from router.types.protobuf import PayloadCase
 
 DEFAULT_DEPTH = 10

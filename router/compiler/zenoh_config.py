@@ -9,7 +9,8 @@ from typing import Any
 
 from router.compiler.extras import missing_extra
 from router.errors import Code, Diagnostic, did_you_mean
-from router.table.model import Gateway, Networks, ZenohConfig
+from router.table.model import Networks
+from router.table.model.gateways import Gateway, ZenohConfig
 from router.table.nodes import Path
 
 try:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from router.compiler.metrics import CLIENT_DROP_REASONS, CLIENTS, GATEWAY_DROP_REASONS, TOPIC_STATES, Counters, Report
-from router.table.model import ROS, Gateway
+from router.table.model.gateways import Gateway
+from router.table.model.routes import ROS
 
 
 class GatewayCounters:

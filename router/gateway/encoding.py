@@ -12,7 +12,7 @@ from router.gateway.json_codec import Encode, encoder
 from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import HEAD, compress, datagrams, prefix, unpack
 from router.gateway.transport.base import Frame
-from router.table.model import Gateway, GatewayFormat, Transport
+from router.table.model.gateways import Gateway, GatewayFormat, Transport
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import MessageType
 

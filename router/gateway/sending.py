@@ -17,7 +17,7 @@ from router.gateway.kept import MOST_KEPT, Kept
 from router.gateway.publishers import Selection
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import PER_TURN, Frame
-from router.table.model import EACH, Gateway, Transport
+from router.table.model.gateways import EACH, Gateway, Transport
 
 MOST_UNCONVERTED = 4
 """Maximum large messages of one topic that wait to be converted, if every message is sent."""

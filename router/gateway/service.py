@@ -16,7 +16,7 @@ from router.gateway.json_types import Style
 from router.gateway.sending import TopicSender
 from router.gateway.topics import Topics
 from router.gateway.transport.base import Client, Frame, Transport
-from router.table.model import Transport as Way
+from router.table.model.gateways import Transport as Way
 
 _TOPICS_S = _LOG_S = 1.0
 _ANSWER_NS = 100_000_000

@@ -33,8 +33,8 @@ from router.log import logger
 from router.net.doors import Door
 from router.table.addresses import Address
 from router.table.keys import are_same
-from router.table.model import Gateway, GatewayFormat
-from router.table.model import Transport as TransportKind
+from router.table.model.gateways import Gateway, GatewayFormat
+from router.table.model.gateways import Transport as TransportKind
 from router.threads import ACCEPTED_AFTER_CLOSING, DaemonThread, StuckError, Thread, join_or_abandon
 from router.types.ros import ros_interfaces
 

@@ -23,7 +23,7 @@ from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import NotInstalledError, TopicSubscription
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Frame
 from router.log import FloodLog, logger
-from router.table.model import EACH, GatewayFormat, Transport
+from router.table.model.gateways import EACH, GatewayFormat, Transport
 
 MOST_TURNS = 20
 """Maximum parts of a period over which topics are spread if each packet is a datagram: receivers with the kernel's

@@ -13,7 +13,7 @@ from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
 from router.image.openings import Openings, period
-from router.table.model import OnLimit
+from router.table.model.targets import OnLimit
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""

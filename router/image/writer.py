@@ -24,7 +24,7 @@ from router.image.names import Names
 from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer
 from router.image.wire_schema import write_schema
-from router.table.model import Endpoint, EndpointKind, Framing
+from router.table.model.endpoints import Endpoint, EndpointKind, Framing
 
 _REJECT_REASONS = [reason.name.lower() for reason in c.Reason]
 

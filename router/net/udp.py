@@ -11,9 +11,9 @@ from router.log import logger
 from router.net import sockets
 from router.net.kernel import bound_interface, drops, why_not_bound
 from router.net.sockets import ABSENT, ListeningSocket
-from router.table import model
 from router.table.addresses import Address, not_one_machine
-from router.table.model import bound_to
+from router.table.model import endpoints
+from router.table.model.endpoints import bound_to
 
 
 def unclaimed() -> list[str]:
@@ -51,7 +51,7 @@ class Listener:
     """
 
     def __init__(
-        self, settings: model.Listener, *, opened: ListeningSocket | None = None, has_senders: bool = False
+        self, settings: endpoints.Listener, *, opened: ListeningSocket | None = None, has_senders: bool = False
     ) -> None:
         self._settings = settings
         try:
@@ -92,7 +92,7 @@ class Listener:
         has_ended = self.is_waiting or self.has_lost_interface()
         return has_ended and absence(self._settings.address.value, self._settings.interface) is None
 
-    def follow(self, settings: model.Listener) -> None:
+    def follow(self, settings: endpoints.Listener) -> None:
         """Adopt name and settings of the next table's listener with the same address and interface."""
         has_changed = settings.receive_buffer != self._settings.receive_buffer
         self._settings = settings
@@ -127,7 +127,7 @@ class Listener:
             )
 
 
-def _refused(settings: model.Listener, error: OSError) -> StartError:
+def _refused(settings: endpoints.Listener, error: OSError) -> StartError:
     kind, why, hint = why_not_bound("udp", settings.address.value.port, error)
     if error.errno == errno.EPERM:
         why, hint = "before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"
@@ -192,13 +192,13 @@ def _is_broadcast(address: Address) -> bool:
 
 
 def open_sending(
-    endpoint: model.Endpoint, source: Listener | None = None, listening: Collection[ListeningSocket] = ()
+    endpoint: endpoints.Endpoint, source: Listener | None = None, listening: Collection[ListeningSocket] = ()
 ) -> socket.socket:
     """Open a socket to send to an endpoint, from the port of `source` if possible, as in `sockets.open_sending`.
 
     `listening` are all open listeners. Raises OSError if descriptors run out.
     """
-    is_board = endpoint.kind is model.EndpointKind.BOARD
+    is_board = endpoint.kind is endpoints.EndpointKind.BOARD
     if source is not None:
         try:
             return sockets.open_sending(source.opened, listening, is_board=is_board)

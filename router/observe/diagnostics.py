@@ -19,7 +19,8 @@ from router.observe.health import PERIOD, HealthSnapshot
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
 from router.observe.watch import Health
-from router.table.model import Endpoint, Route
+from router.table.model.endpoints import Endpoint
+from router.table.model.routes import Route
 from router.threads import Thread, background_threads, join_or_abandon
 from router.values.printing import age_text
 

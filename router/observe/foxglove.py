@@ -34,7 +34,7 @@ from router.observe.running import Running
 from router.recording.channels import descriptor_set
 from router.recording.mirror import Classifier, Mirrored, payload_number
 from router.table.addresses import Address
-from router.table.model import ServerSettings
+from router.table.model.settings import ServerSettings
 from router.threads import ACCEPTED_AFTER_CLOSING, Thread, background_threads, join_or_abandon
 from router.types.protobuf import PayloadCase
 

@@ -33,7 +33,8 @@ from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
-from router.table.model import ANY, EndpointKind
+from router.table.model.endpoints import EndpointKind
+from router.table.model.routes import ANY
 from router.values.printing import age_text
 
 if TYPE_CHECKING:

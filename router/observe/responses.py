@@ -25,7 +25,7 @@ from router.observe.running import Running
 from router.observe.snapshot import COLLECTED_AT
 from router.observe.status import Status
 from router.observe.watch import Health
-from router.table.model import HOW_TO_KEEP
+from router.table.model.settings import HOW_TO_KEEP
 
 PAGE = Path(__file__).with_name("status_page.html")
 

@@ -15,7 +15,11 @@ from router.compiler.program import Program
 from router.compiler.topics import resolved
 from router.errors import listed
 from router.table.keys import phrases
-from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint
+from router.table.model.gateways import Gateway
+from router.table.model.routes import ANY, ROS, Route
+from router.table.model.targets import Destination, Topic
 from router.table.units import duration
 
 COLUMNS = ("from", "payload case", "to")

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import Mismatch
-from router.table.model import ANY
+from router.table.model.routes import ANY
 
 if TYPE_CHECKING:
     from router.compiler.program import Program

@@ -13,7 +13,7 @@ from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edg
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot
 from router.observe.watch import Health
-from router.table.model import Transport
+from router.table.model.gateways import Transport
 
 Json = dict[str, Any]
 

@@ -17,7 +17,8 @@ from google.protobuf.message import Message
 from router.compiler.network import recognisers
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
-from router.table.model import Framing, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import Framing
 from router.threads import Thread, WakeEvent, join_or_abandon
 from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase

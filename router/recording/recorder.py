@@ -25,7 +25,7 @@ from router.recording.encoder import Batch, Encoder, Packer
 from router.recording.incidents import Incident, Incidents
 from router.recording.mirror import Acted, Classifier, Mirror, Mirrored, Taken
 from router.recording.writer import LONGEST_CHUNK, ContinuousWriter, MessageWriter, RecordingDirectory
-from router.table.model import RecordSettings
+from router.table.model.settings import RecordSettings
 from router.threads import Thread, WakeEvent
 
 PERIOD = 500_000_000

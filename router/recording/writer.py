@@ -24,7 +24,7 @@ from router.log import logger
 from router.recording.channels import Channels
 from router.recording.encoder import Batch, Encoder, Message
 from router.shortage import is_shortage
-from router.table.model import RecordSettings
+from router.table.model.settings import RecordSettings
 
 LIBRARY = "rover_router"
 """The name of the library that wrote a recording; its version follows."""

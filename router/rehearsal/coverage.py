@@ -28,7 +28,7 @@ from router.rehearsal.rehearsal import (
     Sent,
 )
 from router.rehearsal.steps import Expected
-from router.table.model import ANY
+from router.table.model.routes import ANY
 
 KINDS = ("route", "target", "rejection")
 

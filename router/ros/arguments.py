@@ -16,7 +16,7 @@ from router import inputs
 from router.compiler.program import Program
 from router.compiler.topics import resolved
 from router.errors import ConfigurationError, nearest
-from router.table.model import NodeSettings
+from router.table.model.settings import NodeSettings
 
 ROUTES_PATH = "routes_path"
 

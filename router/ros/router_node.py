@@ -16,7 +16,7 @@ from router.ros.graph import GraphWatch, Ours, Surroundings
 from router.ros.marks import Mark
 from router.ros.node import close_node, open_node
 from router.ros.topics import RosTopics
-from router.table.model import NodeSettings
+from router.table.model.settings import NodeSettings
 
 
 class RouterNode:

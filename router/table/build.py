@@ -20,37 +20,24 @@ from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
 from router.table.addresses import LOCAL, REMOTE, Address
 from router.table.keys import Key, keys_of
-from router.table.model import (
-    ROS,
-    Choices,
-    Deadman,
-    Destination,
-    Endpoint,
-    EnvelopeSettings,
-    Expression,
-    FieldEntry,
-    FieldMap,
+from router.table.model import Networks, RouteTable
+from router.table.model.endpoints import Endpoint, Listener
+from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.gateways import (
     Gateway,
     GatewayFormat,
     IgnoredGateway,
     Inbound,
     InboundDeadman,
-    Listener,
-    Networks,
-    NodeSettings,
-    Obeyed,
-    Payload,
-    RecordSettings,
-    Route,
-    RouteTable,
-    ServerSettings,
-    Topic,
     TopicPattern,
     TopicRate,
     Transport,
     ZenohConfig,
     ZenohSettings,
 )
+from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
+from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
+from router.table.model.targets import Destination, Topic
 from router.table.nodes import (
     ELSE,
     MAP,

@@ -57,6 +57,9 @@ class Listed(NamedTuple):
     alone: bool = False
 
 
+SOME = Listed(least=1)
+
+
 class Words(NamedTuple):
     """A phrase with `{}` for the key's value; used only if the key `beside` is also set."""
 

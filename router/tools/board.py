@@ -13,7 +13,9 @@ from google.protobuf.message import Message
 from router.compiler.program import DeadmanPlan
 from router.datagrams import Decoded, Wire
 from router.errors import DecodeError, UsageError, did_you_mean
-from router.table.model import EndpointKind, Priority, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.targets import Priority
 from router.types.model import MessageType
 from router.values.printing import compact
 

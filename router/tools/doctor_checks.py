@@ -27,7 +27,8 @@ from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_unreachable
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
-from router.table.model import Endpoint, Listener, Transport, bound_to
+from router.table.model.endpoints import Endpoint, Listener, bound_to
+from router.table.model.gateways import Transport
 
 
 class Grade(enum.Enum):

@@ -27,21 +27,18 @@ from router.rehearsal.fields import shown
 from router.rehearsal.rehearsal import Received, Rehearsal
 from router.ros.environment import check_environment, ros_remedy
 from router.table.keys import flat, phrases
-from router.table.model import (
-    ANY,
+from router.table.model import RouteTable
+from router.table.model.gateways import (
     EACH,
-    ROS,
     Gateway,
     GatewayFormat,
     IgnoredGateway,
-    OnLimit,
-    Route,
-    RouteTable,
-    Topic,
     TopicPattern,
     Transport,
     ZenohSettings,
 )
+from router.table.model.routes import ANY, ROS, Route
+from router.table.model.targets import OnLimit, Topic
 from router.table.units import duration
 from router.tools.udp import LOOPBACK, origin
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage

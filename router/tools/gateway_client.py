@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Union
 from router.compiler.selection import matcher, pattern_problem
 from router.errors import SourceSpan, UsageError
 from router.gateway.packets import HEAD, Packet, PacketError, decompress, unbatched, unpack
-from router.table.model import TopicPattern
+from router.table.model.gateways import TopicPattern
 from router.tools.gateway_sources import MOST_TEXT, Arrival, Source
 from router.values.printing import SHOWN_ELEMENTS, Tree, clock_text, list_text, one_line, plain_text, words
 

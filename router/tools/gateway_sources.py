@@ -20,7 +20,7 @@ from router.errors import Located, SourceSpan, UsageError, did_you_mean
 from router.gateway.packets import Packet, PacketError, pack
 from router.net.kernel import ask_for_receive_buffer, drops
 from router.table.addresses import Address
-from router.table.model import GatewayFormat, ZenohConfig, ZenohSettings
+from router.table.model.gateways import GatewayFormat, ZenohConfig, ZenohSettings
 from router.table.units import LARGEST_DATAGRAM
 from router.tools import udp
 

@@ -12,7 +12,9 @@ from pathlib import Path, PurePosixPath
 from router.compiler import Checked
 from router.errors import UsageError, did_you_mean, nearest, shown_path
 from router.table.compose import resolve, surprise
-from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, EndpointKind
+from router.table.model.settings import EnvelopeSettings
 from router.types.lock_file import read_lock
 from router.types.model import Enum, MessageType
 from router.types.protobuf import Envelope, ProtoSchema, load_protos

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import yaml
 
 from router.errors import Severity, UsageError, shown_path
-from router.table.model import ANY, EndpointKind, Route, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import EndpointKind
+from router.table.model.routes import ANY, Route
 from router.tools.new_message import SCALARS, NewField, NewMessage, Site
 from router.types.lock import LockComparison
 from router.types.lock_file import lock_text

@@ -20,7 +20,9 @@ from router.compiler.program import DeadmanPlan
 from router.datagrams import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address
-from router.table.model import ANY, Endpoint, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint
+from router.table.model.routes import ANY
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose

@@ -14,7 +14,7 @@ from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, payload_number
 from router.recording.reader import Recorded, RecordedAction
-from router.table.model import ANY
+from router.table.model.routes import ANY
 from router.tools.tap import local_time, utc_text
 from router.values.printing import compact, time_text
 

@@ -24,7 +24,7 @@ from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.library import library
 from router.observe.tap import Lost
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
-from router.table.model import Expression
+from router.table.model.expressions import Expression
 from router.table.nodes import TextPlace
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type

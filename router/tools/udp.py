@@ -15,7 +15,8 @@ from router.errors import TransportError, UsageError, did_you_mean
 from router.table.addresses import Address
 
 if TYPE_CHECKING:
-    from router.table.model import Listener, RouteTable
+    from router.table.model import RouteTable
+    from router.table.model.endpoints import Listener
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"

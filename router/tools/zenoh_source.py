@@ -10,7 +10,7 @@ import zenoh
 from router.compiler.zenoh_config import library_config, reason
 from router.errors import StartError, TransportError, UsageError
 from router.gateway.transport.zenoh_session import session_config
-from router.table.model import ZenohSettings
+from router.table.model.gateways import ZenohSettings
 from router.tools.gateway_sources import Arrival, Say
 
 _ANSWER_TIMEOUT = 1.0

@@ -12,7 +12,8 @@ from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscri
 from router.compiler.expressions import Scope, check
 from router.compiler.lowering import LoweredFeed, LoweredRoute, lower_table
 from router.errors import Located
-from router.table.model import Destination, Route, Topic
+from router.table.model.routes import Route
+from router.table.model.targets import Destination, Topic
 from tests.carrier.delivering import Delivering, Outcome, Payload
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, written
 from tests.compiler.judging import Answer, Misfit, Plane, Question

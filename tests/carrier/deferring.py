@@ -14,7 +14,7 @@ from router.carrier.build import NATIVE, compile_c
 from router.carrier.owned import OwnedPointer, open_native
 from router.carrier.reasons import DROP_REASON_NAMES
 from router.image.openings import period
-from router.table.model import Priority
+from router.table.model.targets import Priority
 from tests.carrier.building import MEMORY, sanitizing
 
 NEVER = (1 << 63) - 1

@@ -18,7 +18,8 @@ from router.compiler.mapping import build
 from router.compiler.plan import Record
 from router.errors import Located
 from router.rehearsal.cdr import deserialize
-from router.table.model import Destination, FieldMap, Topic
+from router.table.model.expressions import FieldMap
+from router.table.model.targets import Destination, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import Delivering

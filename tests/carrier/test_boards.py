@@ -17,7 +17,7 @@ from router.compiler.mapping import build
 from router.declared import BoardRefusal, DropReason
 from router.errors import Located, SourceSpan
 from router.image.boards import write_boards
-from router.table.model import FieldMap
+from router.table.model.expressions import FieldMap
 from router.types.board_limits import BoardLimits, board_fields, scalars
 from router.types.model import MessageType
 from router.types.protobuf import find_envelope, load_protos

@@ -17,7 +17,7 @@ from router.carrier import build
 from router.carrier.headers import HeaderError, checks, declarations
 from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
-from router.table.model import Priority
+from router.table.model.targets import Priority
 
 HEADER = """
 #ifndef A_H

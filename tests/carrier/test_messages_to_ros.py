@@ -21,7 +21,7 @@ from router.compiler.lookup import Definitions, nested_types
 from router.compiler.program import Program
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import FieldMap
+from router.table.model.expressions import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
 from tests.carrier.decisions import CarrierSide

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.declared import MAX_DATAGRAM
-from router.table.model import Priority
+from router.table.model.targets import Priority
 from tests.carrier.deferring import Deferring
 from tests.oracles.held_back import BURST, LEAST_OVERDRAFT, LEAST_ROOM, NS, OVERDRAFT, Message, Pacer
 

@@ -20,7 +20,7 @@ from router.net.kernel import IP_FREEBIND
 from router.net.sockets import Inherited
 from router.net.udp import Listener, open_sending
 from router.table.addresses import Address
-from router.table.model import Endpoint, EndpointKind
+from router.table.model.endpoints import Endpoint, EndpointKind
 from tests.namespaces import cable, computers, narrow_path
 from tests.net.test_udp import endpoint, plan
 

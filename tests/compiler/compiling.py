@@ -25,7 +25,7 @@ from router.compiler.plan import Each, Items, Leaf, Record
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.machine import FAILURES, machine

@@ -24,7 +24,7 @@ from router.compiler.plan import Record
 from router.errors import Code, Diagnostic
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Expression, FieldEntry, FieldMap
 from router.types.model import Enum, MessageType, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.messages import some_payloads

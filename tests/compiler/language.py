@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from router.table.model import Expression
+from router.table.model.expressions import Expression
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import chosen, written
 from tests.compiler.payloads import Wire, wire_of

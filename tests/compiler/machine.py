@@ -20,7 +20,7 @@ from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.lowering import lower_table
 from router.compiler.plan import Record
 from router.errors import Located, MappingError, SourceSpan
-from router.table.model import Topic
+from router.table.model.targets import Topic
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
 from tests.carrier.delivering import Delivering, delivering

@@ -14,7 +14,8 @@ from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
 from router.errors import Located, MappingError
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import Destination, FieldMap, Topic
+from router.table.model.expressions import FieldMap
+from router.table.model.targets import Destination, Topic
 from router.types.model import Bytes, Enum, Field, Int, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.carrier.delivering import Delivering

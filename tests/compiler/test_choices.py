@@ -13,7 +13,7 @@ from router.compiler import check_table
 from router.compiler.expressions import ExpressionError
 from router.compiler.mapping import build
 from router.errors import Code
-from router.table.model import Expression, FieldMap
+from router.table.model.expressions import Expression, FieldMap
 from router.types.model import Bool, Enum, Field, Float, Int, MessageType, String
 from tests.compiler.compiling import SPAN, chosen, compiled, field_map, scope_of, serializer, written
 from tests.compiler.machine import FAILURES

@@ -21,7 +21,7 @@ from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
 from router.errors import Code, FindingError, MappingError
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import FieldMap
+from router.table.model.expressions import FieldMap
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
 from tests.compiler.compiling import (

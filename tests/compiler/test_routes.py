@@ -9,7 +9,7 @@ from router.compiler.checked import CheckedSubscription, CheckedTarget
 from router.compiler.expressions.tree import Node, Read, Variable
 from router.compiler.plan import Leaf, Record
 from router.errors import Code, Diagnostic, Severity
-from router.table.model import OnLimit, Priority
+from router.table.model.targets import OnLimit, Priority
 from tests.compiler.conftest import CheckText
 
 ROUTE = """

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from router.compiler.selection import TopicSelector, is_hidden, pattern_problem
 from router.errors import Located, SourceSpan
-from router.table.model import EACH, Gateway, GatewayFormat, TopicPattern, TopicRate, Transport
+from router.table.model.gateways import EACH, Gateway, GatewayFormat, TopicPattern, TopicRate, Transport
 
 SPAN = SourceSpan("table.yaml", 1, 1, 2)
 GATEWAY = Gateway("it", SPAN, Located(Transport.UDP, SPAN), None, None, GatewayFormat.GATEWAY_V1)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from router.compiler.topics import PROFILES, qos_of, resolved, topic_name_finding
 from router.errors import Code, Located, SourceSpan
-from router.table.model import NodeSettings, Qos, Topic
+from router.table.model.settings import NodeSettings
+from router.table.model.targets import Qos, Topic
 from tests.compiler.conftest import CheckText
 
 SPAN = SourceSpan("table.yaml")

@@ -11,7 +11,7 @@ import zenoh
 
 from router.compiler.zenoh_config import config_findings, reason
 from router.errors import SourceSpan
-from router.table.model import ZenohConfig
+from router.table.model.gateways import ZenohConfig
 
 SECRET = "fjord-4711"  # noqa: S105 - of nobody
 HERE = SourceSpan("routes/rover.yaml", 5)

@@ -18,7 +18,7 @@ from router.errors import Located, SourceSpan
 from router.gateway.transport import arrival as gateway_arrival
 from router.gateway.transport.arrival import AWAY_NS, CATCH_UP_NS, LoopClock
 from router.gateway.transport.zenoh import ZenohTransport
-from router.table.model import ZenohSettings
+from router.table.model.gateways import ZenohSettings
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.stream_peers import GREETING, KINDS, framed, join, served
 from tests.gateway.transport_events import Events, opened

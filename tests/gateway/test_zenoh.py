@@ -19,7 +19,7 @@ from router.gateway.transport import zenoh as gateway_zenoh
 from router.gateway.transport.base import HIGH_WATER, Client, Frame
 from router.gateway.transport.zenoh import ZenohTransport
 from router.gateway.transport.zenoh_session import session_config
-from router.table.model import ZenohConfig, ZenohSettings
+from router.table.model.gateways import ZenohConfig, ZenohSettings
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.transport_events import Events, data, opened
 from tests.ports import free_port

@@ -20,7 +20,7 @@ from structlog.testing import capture_logs
 
 from router.errors import Located, SourceSpan
 from router.gateway.transport.zenoh import ZenohTransport
-from router.table.model import ZenohConfig, ZenohSettings
+from router.table.model.gateways import ZenohConfig, ZenohSettings
 from tests.gateway.transport_events import Events
 
 HERE = SourceSpan("routes/rover.yaml")

@@ -19,20 +19,22 @@ from router.net import sockets, udp
 from router.net.kernel import SO_TIMESTAMPNS
 from router.net.sockets import Inherited
 from router.net.udp import Listener, absence, why_unreachable
-from router.table import model
 from router.table.addresses import Address, BadAddressError
-from router.table.model import EndpointKind, Framing
+from router.table.model import endpoints
+from router.table.model.endpoints import EndpointKind, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000
 
 
-def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> model.Listener:
-    return model.Listener(name, SPAN, Located(Address(host, port), SPAN), Framing.EXACT, receive_buffer)
+def plan(
+    name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536
+) -> endpoints.Listener:
+    return endpoints.Listener(name, SPAN, Located(Address(host, port), SPAN), Framing.EXACT, receive_buffer)
 
 
-def endpoint(name: str, address: Address) -> model.Endpoint:
-    return model.Endpoint(name, SPAN, Located(address, SPAN), EndpointKind.TOOL)
+def endpoint(name: str, address: Address) -> endpoints.Endpoint:
+    return endpoints.Endpoint(name, SPAN, Located(address, SPAN), EndpointKind.TOOL)
 
 
 @pytest.fixture
@@ -151,7 +153,7 @@ def test_the_port_of_a_listener_that_accepts_nothing_new_is_the_routers(stack: E
     ],
 )
 def test_an_address_or_interface_that_is_not_there_is_waited_for(
-    stack: ExitStack, settings: model.Listener, why: str
+    stack: ExitStack, settings: endpoints.Listener, why: str
 ) -> None:
     listener = stack.enter_context(closing(Listener(settings)))
     assert (listener.is_waiting, listener.lacks_network(), listener.is_replaceable()) == (True, True, False)
@@ -185,7 +187,7 @@ def held(stack: ExitStack) -> socket.socket:
     return held
 
 
-def plan_of(held: socket.socket) -> model.Listener:
+def plan_of(held: socket.socket) -> endpoints.Listener:
     return plan(port=held.getsockname()[1])
 
 

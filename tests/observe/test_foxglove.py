@@ -33,7 +33,7 @@ from router.observe.foxglove import FoxgloveServer
 from router.observe.running import Running
 from router.recording.mirror import Consumer, MirroredDatagram
 from router.table.addresses import Address
-from router.table.model import ServerSettings
+from router.table.model.settings import ServerSettings
 from tests.observe.foxglove_client import PATIENCE, SUBPROTOCOL, FoxgloveClient
 from tests.tables import PROTOS, ROUTES
 

@@ -22,7 +22,7 @@ from router.observe.foxglove import SUBPROTOCOLS, FoxgloveServer
 from router.observe.http import HttpServer
 from router.observe.running import ReloadResult
 from router.table.addresses import Address
-from router.table.model import ServerSettings
+from router.table.model.settings import ServerSettings
 from tests.acceptance.site import ROOT, wait_until
 from tests.gateway.browser import Browser
 from tests.gateway.fake_gateway import FakeGateway

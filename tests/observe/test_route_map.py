@@ -10,7 +10,7 @@ import pytest
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.observe.route_map import NodeKind, deadman_edges, nodes_and_edges
-from router.table.model import ANY
+from router.table.model.routes import ANY
 from tests.tables import ROUTES
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")

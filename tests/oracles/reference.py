@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, Union
 
-from router.table.model import Expression, FieldMap
+from router.table.model.expressions import Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.oracles.reference_expressions import Context, elements_of, meaning_of, value_of
 from tests.oracles.reference_kinds import (

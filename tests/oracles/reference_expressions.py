@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from router.table.model import Choices, Expression
+from router.table.model.expressions import Choices, Expression
 from router.types.model import Enum, Int, List, MessageType, Type
 from tests.oracles.reference_functions import (
     FUNCTIONS,

@@ -23,7 +23,9 @@ from router.recording.reader import Recorded, Recording
 from router.recording.recorder import Recorder
 from router.recording.writer import RecordingFile
 from router.table.addresses import Address
-from router.table.model import Endpoint, EndpointKind, Framing, RecordSettings, RouteTable
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, EndpointKind, Framing
+from router.table.model.settings import RecordSettings
 from tests.tables import PROTOS
 
 SPAN = SourceSpan("table.yaml", 3)

@@ -10,7 +10,7 @@ from std_msgs.msg import String
 from router.compiler.program import QosPlan, TopicPlan
 from router.errors import SourceSpan
 from router.ros.router_node import RouterNode
-from router.table.model import NodeSettings
+from router.table.model.settings import NodeSettings
 
 STRING = "std_msgs/msg/String"
 RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)

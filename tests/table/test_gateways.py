@@ -9,7 +9,7 @@ import pytest
 
 from router.errors import Code
 from router.table.keys import flat
-from router.table.model import Gateway, Transport
+from router.table.model.gateways import Gateway, Transport
 from tests.table.tables import GATEWAY, SMALL, good, parts, places, shown
 
 HEAD = f"{SMALL}gateways:\n"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, is_dataclass
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Annotated
 
 from router.table import model
@@ -11,7 +13,7 @@ from router.table.build import structure
 from router.table.compose import compose
 from router.table.grammar.keys import properties, required
 from router.table.keys import Listed, Range, Words, flat, keys_of, phrases
-from router.table.model import Destination, OnLimit
+from router.table.model.targets import Destination, OnLimit
 from router.table.nodes import MappingNode
 from router.table.schema import table_schema
 from router.table.source import read_source
@@ -23,7 +25,9 @@ UNITS = ("duration", "size", "disk_size", "data_rate", "period", "rate")
 
 
 def test_every_number_with_a_unit_is_shown_with_it() -> None:
-    models = [part for part in vars(model).values() if is_dataclass(part) and isinstance(part, type)]
+    modules = [import_module(found.name) for found in iter_modules(model.__path__, "router.table.model.")]
+    parts = [part for module in modules for part in vars(module).values()]
+    models = [part for part in parts if is_dataclass(part) and isinstance(part, type)]
     shown = {key.name.rpartition(".")[2] for part in models for key in keys_of(part) if key.quantity is not None}
     in_schema = {path[-1] for path, definition in references(table_schema()) if definition in UNITS}
     assert in_schema >= {"ttl", "retention", "bandwidth", "publish_period", "max_rate", "receive_buffer"}

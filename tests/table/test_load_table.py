@@ -12,7 +12,8 @@ from router.errors import Code
 from router.table import load_table
 from router.table.addresses import Address
 from router.table.keys import flat
-from router.table.model import Route, RouteTable
+from router.table.model import RouteTable
+from router.table.model.routes import Route
 from tests.table.tables import GOOD, SMALL, good, load, parts, places, shown
 
 

@@ -18,7 +18,7 @@ from websockets.sync.server import ServerConnection, serve
 from router.errors import Located, UsageError
 from router.gateway.packets import unpack
 from router.table.addresses import Address
-from router.table.model import GatewayFormat, ZenohSettings
+from router.table.model.gateways import GatewayFormat, ZenohSettings
 from router.tools import gateway_sources
 from router.tools.gateway_sources import Source, Splitter, TcpSource, UdpSource, WebsocketSource, open_source
 from router.tools.zenoh_source import ZenohSource

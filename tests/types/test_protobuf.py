@@ -10,7 +10,7 @@ import pytest
 
 from router.compiler.lookup import Definitions
 from router.errors import Code, Located, SourceSpan, TableError
-from router.table.model import EnvelopeSettings
+from router.table.model.settings import EnvelopeSettings
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, String
 from router.types.protobuf import Envelope, find_envelope, load_protos

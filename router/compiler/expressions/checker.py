@@ -31,7 +31,7 @@ from router.compiler.expressions.scope import ExpressionError, Scope
 from router.compiler.expressions.syntax import Parsed, forbidden
 from router.compiler.expressions.tree import Call, Constant, Node, Operator, constant_of
 from router.errors import Code, Located, SourceSpan, did_you_mean
-from router.table.model import Choices, Expression
+from router.table.model.expressions import Choices, Expression
 from router.table.nodes import TextPlace
 from router.types.model import List, Type
 

@@ -17,7 +17,7 @@ from contextlib import suppress
 from router.compiler.expressions import spellings
 from router.compiler.expressions.scope import ExpressionError
 from router.errors import Code, SourceSpan
-from router.table.model import Expression
+from router.table.model.expressions import Expression
 
 
 class Parsed:

@@ -32,7 +32,7 @@ from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
 from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_OPEN, MOST_SECTIONS_DEEP, MOST_STACKED, NONE, Op
 from router.errors import SourceSpan
-from router.table.model import Route
+from router.table.model.routes import Route
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 

@@ -32,7 +32,7 @@ from router.gateway.transport.zenoh_session import (
     this_owner,
 )
 from router.log import logger
-from router.table.model import ZenohSettings
+from router.table.model.gateways import ZenohSettings
 from router.threads import DaemonThread
 
 CLOSING_SECONDS = 2.0

@@ -18,7 +18,7 @@ from router.clock import wall_ns
 from router.compiler.zenoh_config import is_default, library_config, reason
 from router.errors import ConfigurationError, StartError
 from router.net.kernel import port_taken
-from router.table.model import ZenohSettings
+from router.table.model.gateways import ZenohSettings
 
 LARGE_MESSAGE_US = 2_000_000
 """How long Zenoh waits for room for the fragments of a large message before dropping it (default: 50 ms). 7 MB take

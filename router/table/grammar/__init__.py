@@ -13,7 +13,7 @@ from router.table.grammar.keys import BOOLEAN, TEXT, Schema, key, mapping, part,
 from router.table.grammar.parts import PARTS
 from router.table.grammar.rules import COMPLETE
 from router.table.grammar.values import VALUES
-from router.table.model import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
+from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 
 
 def table_schema() -> Schema:

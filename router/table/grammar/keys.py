@@ -25,17 +25,10 @@ import yaml
 
 from router.errors import SourceSpan
 from router.table.keys import Key, Listed, OneOf, Range, Shape, keys_of
-from router.table.model import (
-    Collect,
-    Deadman,
-    Expression,
-    FieldMap,
-    GatewayFormat,
-    InboundDeadman,
-    Payload,
-    Qos,
-    TopicRate,
-)
+from router.table.model.expressions import Expression, FieldMap
+from router.table.model.gateways import GatewayFormat, InboundDeadman, TopicRate
+from router.table.model.routes import Collect, Deadman, Payload
+from router.table.model.targets import Qos
 
 Schema = dict[str, Any]
 

@@ -5,24 +5,10 @@ from __future__ import annotations
 from router.table.grammar.keys import REASON, TEXT, Schema, about, key, mapping, part, properties, ref, required
 from router.table.grammar.rules import GATEWAY, LIMIT, ROUTE, alone, without
 from router.table.grammar.values import expression, one_of
-from router.table.model import (
-    QOS_PROFILES,
-    Collect,
-    Deadman,
-    DeadmanKeys,
-    Destination,
-    Endpoint,
-    Gateway,
-    IgnoredGateway,
-    Inbound,
-    InboundDeadman,
-    Listener,
-    Obeyed,
-    Qos,
-    Route,
-    Topic,
-    ZenohSettings,
-)
+from router.table.model.endpoints import Endpoint, Listener
+from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
+from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
+from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
 _OF_ALL_TOPICS = ("topic", "type", "queue_depth", "qos")
 

@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from router.table.build import DEFAULT_FORMATS
 from router.table.grammar.keys import Schema, key, ref, required
-from router.table.model import Collect, Endpoint, Listener, RecordSettings, Transport, ZenohSettings
+from router.table.model.endpoints import Endpoint, Listener
+from router.table.model.gateways import Transport, ZenohSettings
+from router.table.model.routes import Collect
+from router.table.model.settings import RecordSettings
 
 
 def without(names: str, message: str) -> Schema:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from router.table.grammar.keys import BOOLEAN, REASON, TEXT, Schema, about, key, mapping, ref
-from router.table.model import FieldMap
+from router.table.model.expressions import FieldMap
 from router.table.units import BYTES, DISK_BYTES, NANOSECONDS
 
 _VARIABLE = r"\$\{"

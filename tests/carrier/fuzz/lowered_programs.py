@@ -18,7 +18,8 @@ from router.compiler.lowering.operations import Routine
 from router.compiler.mapping import build
 from router.errors import Located
 from router.rehearsal.cdr import serialize
-from router.table.model import Destination, FieldMap, Topic
+from router.table.model.expressions import FieldMap
+from router.table.model.targets import Destination, Topic
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
 from tests.carrier import evaluating

@@ -1,0 +1,131 @@
+"""UDP addresses: the listeners of the router, and the endpoints that it knows."""
+
+import enum
+from dataclasses import dataclass
+from typing import Annotated
+
+from router.errors import Located, SourceSpan
+from router.table.addresses import LOCAL, REMOTE, Address
+from router.table.keys import Range, Shape
+from router.table.units import DATA_RATE, PATIENCE, SIZE
+
+
+def bound_to(address: Address, interface: str | None) -> str:
+    """Return the local address of a socket as text: `0.0.0.0:5000`, or `0.0.0.0:5000 on wlan0`."""
+    return f"{address} on {interface}" if interface else str(address)
+
+
+class Framing(enum.Enum):
+    ZERO_TRIMMED = "zero_trimmed"
+    EXACT = "exact"
+
+
+class EndpointKind(enum.Enum):
+    BOARD = "board"
+    BASESTATION = "basestation"
+    TOOL = "tool"
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """A local UDP address that the router binds.
+
+    `span` is its name in the table. `receive_buffer` is in bytes.
+    """
+
+    name: str
+    span: SourceSpan
+    address: Annotated[Located[Address], LOCAL]
+    """The local address to bind; 0.0.0.0 is every network of this computer.
+
+    Title: Listener address
+    Example: 0.0.0.0:5000
+    """
+    framing: Framing = Framing.ZERO_TRIMMED
+    """zero_trimmed: senders may remove trailing zero bytes or pad with them; the router undoes both before it forwards.
+    exact: a datagram is the envelope and nothing else, so a truncated one is never mistaken for a trimmed one.
+    """
+    receive_buffer: Annotated[int, SIZE] = 4 << 20
+    """How much the kernel may hold for this listener while the router is busy. The kernel's own limit
+    (net.core.rmem_max) applies.
+    """
+    interface: Annotated[str | None, Shape("interface")] = None
+    """Receive only datagrams that arrive on this network interface. Several listeners may have the same address, each
+    on an interface of its own.
+
+    Example: wlan0
+    Example: wg0
+    """
+
+    @property
+    def bound_to(self) -> str:
+        return bound_to(self.address.value, self.interface)
+
+
+EPHEMERAL = "ephemeral"
+"""The value of `send_from` for a source port chosen by the kernel, instead of a listener's port."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A named UDP address: a board, a basestation, a tool.
+
+    `span` is its name in the table. `bandwidth` is in bytes per second, `stale_after` in ns, None for never.
+    `send_from` is a listener's name, EPHEMERAL, or None if it is not set.
+    """
+
+    name: str
+    span: SourceSpan
+    address: Annotated[Located[Address], REMOTE]
+    """Where datagrams to it are sent. Datagrams from it are recognised by the IP address.
+
+    Title: Endpoint address
+    Example: 192.168.0.30:8
+    """
+    kind: EndpointKind
+    """board: a microcontroller that decodes into fixed-size structures, so datagrams for it are checked against their
+    limits. basestation or tool: an ordinary computer.
+
+    Example: board
+    """
+    listener: Located[str] | None = None
+    """Accept its datagrams only at this listener; at any other, a datagram from its address counts as a stranger's.
+    Default: accept them at every listener.
+
+    Example: radio
+    """
+    send_from: Located[str] | None = None
+    """Send datagrams to it from this listener's address and port, so that replies reach that listener. ephemeral: from
+    a port that the kernel chooses, so replies are lost. Default: the endpoint's listener; without one, the address and
+    port of all listeners if they are the same, else ephemeral.
+
+    Example: rover
+    Example: ephemeral
+    """
+    source_port: Annotated[Located[int] | None, Range(1, 65_535)] = None
+    """The UDP port that it sends from. Needed to distinguish endpoints that share an IP address.
+
+    Example: 9000
+    """
+    stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
+    """An endpoint that has been silent for longer counts as stale in diagnostics, on the status page, for 'router
+    doctor' and in alerts. never: for an endpoint that only sends now and then.
+
+    Example: 5s
+    Example: never
+    """
+    bandwidth: Annotated[int | None, DATA_RATE] = None
+    """The most bytes per second to send to it: the capacity of the radio link. When it is used up, commands go first,
+    then telemetry, then bulk, and the oldest bulk is dropped. It counts the bytes of router_sent_bytes_total: UDP and
+    IP add 28 to each datagram, the link more. Default: no limit.
+
+    Example: 500kB/s
+    """
+    trim_trailing_zeros: bool = False
+    """Send envelopes to it without their trailing zero bytes, for a receiver that restores them."""
+    allow_non_finite: bool = False
+    """Send a board datagrams with NaN or infinity, because its firmware handles them. Default: drop them as non_finite.
+    Only for kind: board; other endpoints always get them.
+
+    Title: Allow NaN and infinity
+    """

@@ -1,0 +1,146 @@
+"""Settings of the table as a whole: envelope, node, servers, recording."""
+
+from dataclasses import dataclass
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import Annotated
+
+from router.errors import Located, SourceSpan
+from router.table.addresses import LOCAL, Address
+from router.table.keys import SOME, Named, Shape
+from router.table.units import DISK_SIZE, DURATION
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeSettings:
+    """Which protobuf message wraps every payload on the wire.
+
+    `protos` and `lock` are absolute paths; without `lock`, the lock file is beside the protos.
+    """
+
+    protos: Located[Path]
+    """The folder with the .proto files, relative to this file. Default: the protos shipped with the router.
+
+    Title: Proto folder
+    Example: ../protos
+    """
+    message: Located[str]
+    """The name of the protobuf message that every datagram holds.
+
+    Title: Envelope message
+    Example: PBEnvelope
+    """
+    oneof: Located[str]
+    """The name of the envelope's oneof whose members are the payload cases.
+
+    Title: Payload oneof
+    Example: payload
+    """
+    lock: Located[Path] | None = None
+    """The file that records the field numbers, relative to this file. Default: envelope.lock.json in the folder of the
+    .proto files. Set it if that folder is not yours to change, such as a submodule.
+
+    Title: Lock file
+    Example: ../envelope.lock.json
+    """
+    exclude: tuple[Located[str], ...] = ()
+    """Files and folders of `protos`, relative to it, that are ignored: files of other people in that folder that the
+    envelope does not import.
+
+    Title: Excluded protos
+    Example: [motor/old.proto, tests]
+    """
+    because: Annotated[str | None, Shape("reason")] = None
+    """Why boards accept envelopes whose fields beside the payload are empty. The router fills none in those that it
+    makes from ROS messages and for deadman timers; forwarded ones keep theirs.
+
+    Example: boards do not check the sequence number
+    Error: must be a text that says why these fields may be empty
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSettings:
+    """How the router appears in the ROS graph.
+
+    `span` is the key `node`, `diagnostics` the span of its key, None if off.
+
+    Title: ROS node
+    """
+
+    name: Annotated[str, Shape("node_name")] = "rover_router"
+    """The ROS node's name.
+
+    Title: Node name
+    """
+    namespace: Annotated[str, Shape("namespace")] = "/"
+    """The ROS namespace in which relative topic names are resolved.
+
+    Title: Node namespace
+    """
+    diagnostics: SourceSpan | None = None
+    """Publish one status for each route and endpoint on /diagnostics once a second, for ROS's own monitors."""
+    span: SourceSpan | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ServerSettings:
+    """A server of the router, for clients from `networks` or from anywhere. `span` is its key in the table."""
+
+    span: SourceSpan
+    address: Annotated[Located[Address], LOCAL]
+    """The local TCP address that clients connect to."""
+    networks: Annotated[tuple[IPv4Network, ...], Named("from"), SOME] = ()
+    """Only clients in these networks may connect, and always those on the router's own computer, which include all
+    clients of a proxy there. Others are refused, counted and logged. Without this key anybody may connect.
+
+    Title: Clients' networks
+    Example: [192.168.0.0/24]
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """Record every received datagram, including rejected ones, in MCAP files.
+
+    `span` is the key `record`; `directory` is an absolute path. `last` and `max_age` are in ns, sizes in bytes.
+
+    Title: Recording
+    """
+
+    span: SourceSpan
+    directory: Path
+    """Where the files are written, relative to this file. The directory is created if it is missing.
+
+    Example: ../recordings
+    """
+    continuous: bool = True
+    """Write everything to files all the time. false: write only what 'last' holds, on request."""
+    last: Annotated[int | None, DURATION] = None
+    """Keep this much in memory, and save it to a file of its own on SIGUSR1, on POST /record/save, and when a deadman
+    trips.
+
+    Example: 60s
+    """
+    max_size: Annotated[int, DISK_SIZE, Named("rotate_after.size")] = 256 << 20
+    """Begin a new file when the current one reaches this size.
+
+    Example: 256MiB
+    """
+    max_age: Annotated[int, DURATION, Named("rotate_after.age")] = 600_000_000_000
+    """Begin a new file when the current one reaches this age.
+
+    Example: 10min
+    """
+    retention: Annotated[int, DISK_SIZE] = 4 << 30
+    """Delete the router's oldest files in the directory when their total size exceeds this.
+
+    Example: 4GiB
+    """
+
+
+HOW_TO_KEEP = (
+    "add `last: 60s` to the table's 'record', or `record: {directory: ../recordings, last: 60s, continuous: false}`, "
+    "and restart the router"
+)
+"""What to do if a router keeps no datagrams to save."""
