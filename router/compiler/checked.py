@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
@@ -15,14 +16,22 @@ from router.table.model.targets import Destination, OnLimit, Priority, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
+if TYPE_CHECKING:
+    from router.compiler.lowering.operations import Routine
+
 
 @dataclass(frozen=True, slots=True)
-class CheckedTarget:
-    """A target of a route, as the table declares it, with the results of its check.
+class Target:
+    """A target of a route, as the table declares it, with the results of its check, and then its routines.
 
     `endpoint` is set for a destination, `type` for a published topic. Without a `plan`, the datagram is forwarded
     unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command to this
-    target feeds or disarms.
+    target feeds (its own route's) or disarms.
+
+    `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
+    without a `when`, or without a `plan`. `places` are the places of the table where a message may be rejected, by
+    `enum place` in `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are already
+    checked), the condition, `for_each` or `collect`, and the field of each operation of `message`.
     """
 
     declared: Destination | Topic
@@ -33,6 +42,13 @@ class CheckedTarget:
     rows: tuple[Row, ...] = ()
     declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
+    condition: Routine = ()
+    message: Routine = ()
+    places: tuple[str, ...] = ()
+
+    @property
+    def is_topic(self) -> bool:
+        return isinstance(self.declared, Topic)
 
     @property
     def is_command(self) -> bool:
@@ -60,7 +76,7 @@ class CheckedTarget:
 
     @property
     def is_deferred(self) -> bool:
-        """Whether its messages may be deferred and then sent by another thread."""
+        """Whether its messages may be deferred and then sent by another thread: see `on_limit` and `bandwidth`."""
         has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 
@@ -79,7 +95,7 @@ class CheckedSubscription:
     when: Node | None
     for_each: Node | None
     stamp: Node | None
-    targets: tuple[CheckedTarget, ...]
+    targets: tuple[Target, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +126,7 @@ class CheckedRoute:
 
     route: Route
     case: PayloadCase
-    targets: tuple[CheckedTarget, ...] = ()
+    targets: tuple[Target, ...] = ()
     subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
     deadman: DeadmanPlan | None = None

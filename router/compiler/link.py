@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
 from router.compiler.lookup import definitions_of
+from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
-from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TargetPlan, TopicPlan
+from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TopicPlan
 from router.compiler.series import open_series
 from router.compiler.topics import qos_of
 from router.table.model import RouteTable
@@ -34,10 +35,10 @@ def link(checked: Checked, counters: Counters) -> Program | None:
     for route in served:
         if not route.route.is_outbound:
             number = route.case.number
-            inbound[number] = (*inbound.get(number, ()), _route_plan(route, _sources(route.route, table)))
+            inbound[number] = (*inbound.get(number, ()), _route_plan(route, lowered, _sources(route.route, table)))
         for feed in route.subscriptions:
             topic = feed.topic.topic.value
-            outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, frozenset(), feed))
+            outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, lowered, frozenset(), feed))
     deadmen = tuple(route.deadman for route in served if route.deadman)
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
@@ -94,15 +95,14 @@ def _sources(route: Route, table: RouteTable) -> frozenset[str | None]:
 
 
 def _route_plan(
-    checked: CheckedRoute, sources: frozenset[str | None], feed: CheckedSubscription | None = None
+    checked: CheckedRoute, lowered: Lowered, sources: frozenset[str | None], feed: CheckedSubscription | None = None
 ) -> RoutePlan:
     """Return the plan of `feed`, or of a route from UDP."""
     route = checked.route
-    targets = feed.targets if feed else checked.targets
     return RoutePlan(
         route=route.name,
         case=checked.case,
-        targets=tuple(map(_target_plan, targets)),
+        targets=tuple(_targets(checked, lowered, feed)),
         sources=sources,
         topic=feed.topic.topic.value if feed else None,
         ttl=route.ttl.value if route.ttl else None,
@@ -110,14 +110,12 @@ def _route_plan(
     )
 
 
-def _target_plan(target: CheckedTarget) -> TargetPlan:
-    return TargetPlan(
-        label=target.label,
-        is_topic=target.topic is not None,
-        max_rate=target.declared.max_rate,
-        on_limit=target.declared.on_limit,
-        priority=target.priority,
-        is_deferred=target.is_deferred,
-        is_command=target.is_command,
-        deadmen=target.deadmen,
-    )
+def _targets(checked: CheckedRoute, lowered: Lowered, feed: CheckedSubscription | None) -> Iterator[Target]:
+    """Yield the targets with their routines, which a destination that gets every datagram does not have."""
+    name = checked.route.name
+    if feed is not None:
+        feeds = {served.route: served for served in lowered.from_ros[feed.topic.topic.value]}
+        yield from feeds[name].targets.values()
+    for target in checked.targets:
+        route = (lowered.to_topics if target.is_topic else lowered.to_destinations).get(name)
+        yield route.targets.get(target.label, target) if route else target

@@ -11,12 +11,12 @@ from router.compiler.metrics import Counters
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, Inbound
-from router.table.model.targets import OnLimit, Priority
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
 if TYPE_CHECKING:
+    from router.compiler.checked import Target
     from router.compiler.lowering import Lowered
 
 STRANGER = None
@@ -60,25 +60,6 @@ class TopicPlan:
     type_name: str
     qos: QosPlan
     definitions: Mapping[str, tuple[tuple[str, str], ...]]
-
-
-@dataclass(frozen=True, slots=True)
-class TargetPlan:
-    """A target of a route, with its `label` in metrics.
-
-    A target that `is_deferred` may be served later and by another thread: it has `on_limit: latest`, or its endpoint
-    has a bandwidth. `is_command`: its messages are commands. `deadmen` are the routes whose deadmen each command feeds
-    (its own route's) or disarms. The plan contains no positions, because a reload uses it as a key of state.
-    """
-
-    label: str
-    is_topic: bool
-    max_rate: float | None
-    on_limit: OnLimit = OnLimit.FIRST
-    priority: Priority = Priority.TELEMETRY
-    is_deferred: bool = False
-    is_command: bool = False
-    deadmen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +131,7 @@ class RoutePlan:
 
     route: str
     case: PayloadCase
-    targets: tuple[TargetPlan, ...]
+    targets: tuple[Target, ...]
     sources: frozenset[str | None]
     topic: str | None = None
     ttl: int | None = None

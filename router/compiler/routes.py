@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, Target
 from router.compiler.deadmen import check_deadman
 from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
@@ -139,9 +139,9 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
 
 def _destination(
     lookup: Lookup, route: Route, destination: Destination, endpoint: Endpoint | None, scope: Scope
-) -> CheckedTarget:
+) -> Target:
     """Check a destination. Return it without its plan."""
-    return CheckedTarget(
+    return Target(
         destination,
         endpoint=endpoint,
         when=lookup.when(destination.when, scope),
@@ -170,7 +170,7 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
 
 def _forward(
     lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
-) -> CheckedTarget:
+) -> Target:
     if destination.fields is not None:
         message, hint = "datagrams are forwarded unchanged", "use 'fields' only for messages from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
@@ -179,14 +179,14 @@ def _forward(
 
 def _publish(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Node]
-) -> CheckedTarget:
+) -> Target:
     scope = lookup.scope(case.type, ros_type, names, route)
     if not names:
         scope.absent = dict.fromkeys((ITEMS, COUNT), (_NO_COLLECT, _COLLECT))
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
     lookup.findings += mapping.findings
-    return CheckedTarget(topic, type=ros_type, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
+    return Target(topic, type=ros_type, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:

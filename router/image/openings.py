@@ -12,8 +12,9 @@ from math import ceil
 from typing import TYPE_CHECKING, Any
 
 from router import declared as c
+from router.compiler.checked import Target
 from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan, Program, RoutePlan, TargetPlan, TopicPlan
+from router.compiler.program import DeadmanPlan, Program, RoutePlan, TopicPlan
 from router.image.memory import Symbols
 from router.image.names import Names
 
@@ -51,13 +52,13 @@ class Openings:
     def sender(self, endpoint: str) -> int:
         return self.symbols.address("sender", endpoint)
 
-    def limit(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> int:
+    def limit(self, plan: RoutePlan, target: Target, source: str | None) -> int:
         """Open the limit of a target with `max_rate` for one source of its route."""
-        assert target.max_rate is not None  # noqa: S101 - checked by the caller
+        assert target.declared.max_rate is not None  # noqa: S101 - checked by the caller
         return self._open(
             ("limit", plan.route, plan.topic, source, target.label),
             "limit_open",
-            period(target.max_rate),
+            period(target.declared.max_rate),
             of=_plain(target),
         )
 
@@ -69,7 +70,7 @@ class Openings:
         bandwidth = self.program.table.endpoints[endpoint].bandwidth
         return self._open(("pacer", endpoint), "pacer_open", bandwidth, of=(self._argument("sender", endpoint),))
 
-    def deferral(self, plan: RoutePlan, target: TargetPlan, source: str | None) -> int:
+    def deferral(self, plan: RoutePlan, target: Target, source: str | None) -> int:
         """Open what holds back messages of a source for a target, as long as the destination is the same."""
         symbol = "deferral", plan.route, plan.topic, source, target.label
         if target.is_topic:
@@ -173,7 +174,8 @@ def _settings(topic: TopicPlan) -> tuple[object, ...]:
     return (topic.topic, topic.type_name, *astuple(topic.qos), *sorted(topic.definitions.items()))
 
 
-def _plain(target: TargetPlan) -> tuple[object, ...]:
+def _plain(target: Target) -> tuple[object, ...]:
     """Return the settings of a target as plain values."""
     flags = target.is_topic, target.is_deferred, target.is_command
-    return (target.label, target.max_rate, target.on_limit.name, target.priority.name, *flags, *target.deadmen)
+    declared = target.declared
+    return (target.label, declared.max_rate, declared.on_limit.name, target.priority.name, *flags, *target.deadmen)

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
-from router.compiler.lowering import LoweredCollect, LoweredRoute, LoweredTarget
+from router.compiler.checked import Target
+from router.compiler.lowering import LoweredCollect, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
-from router.compiler.program import STRANGER, Program, RoutePlan, TargetPlan, source_label
+from router.compiler.program import STRANGER, Program, RoutePlan, source_label
 from router.image.openings import Openings, period
-from router.table.model.targets import OnLimit
+from router.table.model.targets import OnLimit, TargetKeys
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
@@ -43,12 +44,12 @@ class TargetWriter:
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _sources: Any = None
 
-    def of_datagrams(self, plan: RoutePlan, targets: Sequence[TargetPlan], lowered: LoweredRoute | None) -> c.Targets:
+    def of_datagrams(self, plan: RoutePlan, targets: Sequence[Target], lowered: LoweredRoute | None) -> c.Targets:
         """Write the targets that get datagrams; `lowered` are the routines of targets that have some."""
         if lowered is None:
-            return self.targets(plan, targets, {}, None)
+            return self.targets(plan, targets, None)
         routines = Routines(lowered.layout, self.arrays)
-        written = self.targets(plan, targets, lowered.targets, routines)
+        written = self.targets(plan, targets, routines)
         if lowered.collect is not None:
             collect = write_collect(lowered.collect, routines, self._numbers_of_senders())
             collect.collector = self.openings.collector(plan)
@@ -57,15 +58,9 @@ class TargetWriter:
         written.layout, written.sources = routines.layout(), self.names_of_senders()
         return written
 
-    def targets(
-        self,
-        plan: RoutePlan,
-        targets: Sequence[TargetPlan],
-        lowered: Mapping[str, LoweredTarget],
-        routines: Routines | None,
-    ) -> c.Targets:
-        """Write the targets, without their layout."""
-        array = self.arrays.array(c.Target, [self._target(plan, each, lowered, routines) for each in targets])
+    def targets(self, plan: RoutePlan, targets: Sequence[Target], routines: Routines | None) -> c.Targets:
+        """Write the targets, without their layout. Only if they have routines, `routines` is needed."""
+        array = self.arrays.array(c.Target, [self._target(plan, each, routines) for each in targets])
         number = self.openings.names.number
         together = c.Targets(
             ttl=plan.ttl or 0,
@@ -81,7 +76,7 @@ class TargetWriter:
                 written.deferrals = self._by_source(deferrals)
                 to = ctypes.addressof(together), ctypes.addressof(written)
                 self.timers += [Timer(each, target.is_topic, *to) for each in deferrals.values()]
-            if target.max_rate is not None and not written.period:
+            if target.declared.max_rate is not None and not written.period:
                 limits = {at: self.openings.limit(plan, target, source) for at, source in sources.items()}
                 written.limits = self._by_source(limits)
             if target.deadmen:
@@ -89,14 +84,11 @@ class TargetWriter:
                 written.feeds, written.feed_count = self.arrays.array(c.Feed, feeds), len(feeds)
         return self.arrays.add(together)
 
-    def _target(
-        self, plan: RoutePlan, target: TargetPlan, lowered: Mapping[str, LoweredTarget], routines: Routines | None
-    ) -> c.Target:
+    def _target(self, plan: RoutePlan, target: Target, routines: Routines | None) -> c.Target:
         counters, place = self.program.counters, (plan.route, target.label)
         written = self._topic(target.label) if target.is_topic else self._destination(target.label)
-        if routines is not None and target.label in lowered:
-            written.condition = routines.routine(lowered[target.label].condition)
-            written.message = routines.routine(lowered[target.label].message)
+        if routines is not None:
+            written.condition, written.message = map(routines.routine, (target.condition, target.message))
         written.id = self.openings.names.number(target.label)
         written.waiting = counters.index("messages_waiting", *place)
         written.filtered = counters.index("messages_filtered", *place)
@@ -106,7 +98,7 @@ class TargetWriter:
         written.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in _DROP_REASONS]
         if not target.is_topic:
             written.delivered_bytes = counters.index("sent_bytes", *place)
-        written.period, written.priority = _held_period(target), c.Priority[target.priority.name]
+        written.period, written.priority = _held_period(target.declared), c.Priority[target.priority.name]
         return written
 
     def _destination(self, endpoint: str) -> c.Target:
@@ -124,7 +116,7 @@ class TargetWriter:
             self._topics[topic] = self.arrays.add(written)
         return c.Target(topic=ctypes.pointer(self._topics[topic]))
 
-    def _feed(self, plan: RoutePlan, target: TargetPlan, route: str) -> c.Feed:
+    def _feed(self, plan: RoutePlan, target: Target, route: str) -> c.Feed:
         """Return the effect of the target's commands on the deadman of a route: its own, or one that they disarm."""
         feed = self.openings.feed(route, target.label, disarms=route != plan.route)
         held = self.openings.holding(route, target.label) if feed.disarms else []
@@ -173,6 +165,6 @@ def write_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence
     )
 
 
-def _held_period(target: TargetPlan) -> int:
+def _held_period(declared: TargetKeys) -> int:
     """Return the time between two messages of a target with `on_limit: latest`, in ns; otherwise 0."""
-    return period(target.max_rate) if target.max_rate is not None and target.on_limit is OnLimit.LATEST else 0
+    return period(declared.max_rate) if declared.max_rate is not None and declared.on_limit is OnLimit.LATEST else 0

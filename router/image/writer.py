@@ -249,7 +249,7 @@ def _ros_routes(writer: TargetWriter, topic: str, feeds: tuple[LoweredFeed, ...]
 def _ros_route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
     assert plan.topic is not None  # noqa: S101 - a route from ROS has a topic
     counters, routines = writer.program.counters, Routines(feed.layout, writer.arrays)
-    targets = writer.targets(plan, plan.targets, feed.targets, routines)
+    targets = writer.targets(plan, plan.targets, routines)
     for_each = write_for_each(feed.for_each, routines)
     targets.layout = routines.layout()
     seconds, nanoseconds = feed.stamp or (NONE, NONE)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedRoute, Target
 from router.compiler.expressions.tree import Node
 from router.compiler.program import Program
 from router.errors import SourceSpan
@@ -149,7 +149,7 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
             yield ("rate_limited", name, target.label), Item("rejection", target.span, gap)
 
 
-def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Node | None]]:
+def _with_conditions(route: CheckedRoute) -> Iterator[tuple[Target, Node | None]]:
     """Yield every target of a route, with its `when` or that of the topic that feeds it."""
     yield from ((target, target.when) for target in route.targets)
     for subscription in route.subscriptions:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedTarget
+from router.compiler.checked import Target
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.compiler.program import Program
 from router.datagrams import Wire
@@ -47,7 +47,7 @@ class TableIndex:
 
     def __init__(self, checked: Checked) -> None:
         self._routes = {route.route.name: route for route in checked.routes}
-        self._targets: dict[tuple[str, str], list[CheckedTarget]] = {}
+        self._targets: dict[tuple[str, str], list[Target]] = {}
         for route in checked.routes:
             for target in (
                 *route.targets,

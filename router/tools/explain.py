@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from router.compiler import Checked
 from router.compiler.cdr import message_size
-from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedRoute, Target
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
@@ -146,7 +146,7 @@ def _source(name: str, table: RouteTable) -> str:
     return f"{name} ({endpoint.address.value.host}{port}{by})"
 
 
-def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Checked, how: str) -> Iterator[str]:
+def _destination(served: Target, checked: CheckedRoute, everything: Checked, how: str) -> Iterator[str]:
     """Yield what happens to a message for an endpoint, in this order."""
     endpoint = served.endpoint
     assert endpoint is not None  # noqa: S101 - that of a destination
@@ -163,7 +163,7 @@ def _destination(served: CheckedTarget, checked: CheckedRoute, everything: Check
         yield "    feeds its own deadman" if others else "    feeds the deadman"
 
 
-def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
+def _topic(served: Target, topic: Topic, route: Route) -> Iterator[str]:
     """Yield what happens to a message that is published, in this order."""
     yield f"  topic {served.label}: {topic.type_name}  ({served.span})"
     yield _quality(topic)
@@ -177,7 +177,7 @@ def _topic(served: CheckedTarget, topic: Topic, route: Route) -> Iterator[str]:
     yield from _waiting(served)
 
 
-def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
+def _conditions(served: Target, route: Route) -> Iterator[str]:
     """Yield what decides whether a target gets a message."""
     words = phrases(served.declared)
     if when := words.get("when"):
@@ -188,7 +188,7 @@ def _conditions(served: CheckedTarget, route: Route) -> Iterator[str]:
         yield f"    {words['max_rate']}, {words['on_limit']}"
 
 
-def _waiting(served: CheckedTarget) -> Iterator[str]:
+def _waiting(served: Target) -> Iterator[str]:
     """Yield what decides when a message that is ready is sent."""
     words = phrases(served.declared)
     if "max_rate" in words and served.declared.on_limit is OnLimit.LATEST:
@@ -233,7 +233,7 @@ def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
     return f"{plural(bound, unit)} or none" if is_fixed else f"up to {plural(bound, unit)}"
 
 
-def _mapping(served: CheckedTarget) -> Iterator[str]:
+def _mapping(served: Target) -> Iterator[str]:
     """Yield one line for each mapped field, in columns, and the fields that nothing fills."""
     yield from _rows(served.rows)
     if served.plan is not None and (unset := list(_unset(served.plan, ""))):

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from router.compiler.checked import CheckedRoute
+from router.compiler.checked import CheckedRoute, Target
 from router.compiler.expressions import tree
-from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredTarget
+from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements
 from router.compiler.lowering.layout import Layout, ReadOperation, WantedField
 from router.compiler.lowering.operations import Operation, Routine
 from router.compiler.program import Program
@@ -103,7 +103,7 @@ def _step(step: ReadOperation, layout: Layout) -> str:
 # ---- operations
 
 
-def _target(kind: str, target: LoweredTarget, layout: Layout) -> Iterator[str]:
+def _target(kind: str, target: Target, layout: Layout) -> Iterator[str]:
     yield ""
     yield f"  {kind} {target.label}"
     _, when, _, *places = target.places
@@ -111,7 +111,7 @@ def _target(kind: str, target: LoweredTarget, layout: Layout) -> Iterator[str]:
     yield from _listed(target.message, places, layout)
 
 
-def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) -> Iterator[str]:
+def _for_each(elements: LoweredElements, layout: Layout, target: Target) -> Iterator[str]:
     _, _, place, *_ = target.places
     yield ""
     yield f"  elements, {_stored(elements.scalar)}"
@@ -121,7 +121,7 @@ def _for_each(elements: LoweredElements, layout: Layout, target: LoweredTarget) 
     yield f"    each -> {', '.join(into)}" if into else "    each"
 
 
-def _collect(collect: LoweredCollect, layout: Layout, target: LoweredTarget) -> Iterator[str]:
+def _collect(collect: LoweredCollect, layout: Layout, target: Target) -> Iterator[str]:
     _, _, place, *_ = target.places
     for what, routine in (("frame", collect.by), ("its size", collect.count), ("the place in it", collect.order)):
         yield ""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any
 
-from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, Target
 from router.compiler.expressions import Scope, check
 from router.compiler.lowering import LoweredFeed, LoweredRoute, lower_table
 from router.errors import Located
@@ -65,12 +65,12 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
     topic, span = Topic(Located(SOURCE, SPAN), SPAN), SPAN
     route, envelope = Route(name=_ROUTE, span=span, case=Located(_ROUTE, span)), language_wire()[1]
     if asked.language.is_ros:
-        target = CheckedTarget(Destination(Located("endpoint", span), span), plan=plan)
+        target = Target(Destination(Located("endpoint", span), span), plan=plan)
         feed = CheckedSubscription(topic, asked.source, condition, for_each, None, (target,))
         lowered, findings = lower_table([CheckedRoute(route, asked.case, subscriptions=(feed,))])
     else:
         declared = topic if plan is not None else Destination(Located("endpoint", span), span)
-        target = CheckedTarget(declared, type=asked.target, when=condition, plan=plan)
+        target = Target(declared, type=asked.target, when=condition, plan=plan)
         case, collect = envelope.cases["source"], _collect(asked) if asked.language.is_frame else None
         lowered, findings = lower_table([CheckedRoute(route, case, (target,), collect=collect)])
     if findings:

@@ -9,7 +9,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
 from router.compiler.expressions import Scope, check
 from router.compiler.expressions.kinds import UINT32, ListKind
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable
@@ -66,7 +66,7 @@ def to_ros(
     """From a payload to the message of a topic. Raises Misfit or ExpressionError."""
     enums = tuple(wire[0].enums.values())
     plan = _plan(fields, target, Scope(case.type, enums, ros_types))
-    checked = CheckedTarget(Topic(Located(TOPIC, SPAN), SPAN), None, target, None, plan)
+    checked = Target(Topic(Located(TOPIC, SPAN), SPAN), None, target, None, plan)
     lowered, findings = lower_table([CheckedRoute(_route(), case, (checked,))])
     if findings:
         raise Misfit(findings)
@@ -100,7 +100,7 @@ def from_ros(
         scope = Scope(source, enums, (), names)
     condition = check(written(when), scope) if when else None
     plan = _plan(fields, case.type, scope, scope.names.get(ITEM))
-    checked = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=plan, when=condition)
+    checked = Target(Destination(Located("board", SPAN), SPAN), plan=plan, when=condition)
     feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, elements, None, (checked,))
     lowered, findings = lower_table([CheckedRoute(_route(), case, subscriptions=(feed,))])
     if findings:

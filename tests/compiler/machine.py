@@ -16,7 +16,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from router.carrier.build import LIBRARY, build, is_current
-from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedRoute, Target
 from router.compiler.lowering import lower_table
 from router.compiler.plan import Record
 from router.errors import Located, MappingError, SourceSpan
@@ -56,7 +56,7 @@ def machine(
     """A function from a message to the bytes that the plan gives. It raises one of FAILURES if there are none."""
     case = payload_of(source)
     span = SourceSpan("table.yaml", 7, 3, 9)
-    checked = CheckedTarget(Topic(Located("topic", span), span), type=target, plan=plan)
+    checked = Target(Topic(Located("topic", span), span), type=target, plan=plan)
     route: Any = SimpleNamespace(name=_ROUTE, ttl=None, ignore=None, span=span)
     lowered, findings = lower_table([CheckedRoute(route, case, (checked,))])
     assert not findings, findings

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
 from router.compiler.expressions import Scope
 from router.compiler.lowering import lower_table
 from router.compiler.mapping import build
@@ -60,7 +60,7 @@ def machine_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: Me
     mapping = build(fields, case.type, Scope(source, tuple(schema.enums.values()), ()), SPAN)
     assert mapping.findings == []
     route: Any = SimpleNamespace(name="route", ttl=None, ignore=None, span=SPAN)
-    target = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=mapping.plan)
+    target = Target(Destination(Located("board", SPAN), SPAN), plan=mapping.plan)
     feed = CheckedSubscription(Topic(Located(SOURCE, SPAN), SPAN), source, None, None, None, (target,))
     lowered, findings = lower_table([CheckedRoute(route, case, subscriptions=(feed,))])
     assert findings == []

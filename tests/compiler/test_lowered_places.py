@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from router.compiler.lowering import LoweredTarget
+from router.compiler.checked import Target
 from router.declared import Op
 from tests.compiler.conftest import CheckText
 
 
-def lowered(check_text: CheckText, topic: str, payload: str = "imu_info") -> LoweredTarget:
+def lowered(check_text: CheckText, topic: str, payload: str = "imu_info") -> Target:
     checked = check_text(f"routes:\n  {payload}:\n    source: board\n    topics:\n      - {topic}\n")
     assert checked.program is not None, checked.diagnostics
     [target] = checked.program.lowered.to_topics[payload].targets.values()

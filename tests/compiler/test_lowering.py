@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from router.compiler import check_table
+from router.compiler.checked import Target
 from router.compiler.expressions import check
 from router.compiler.lookup import Definitions
-from router.compiler.lowering import LoweredTarget, operations, sources
+from router.compiler.lowering import operations, sources
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.layout import ReadOperation
 from router.compiler.lowering.names import TooLargeError
@@ -385,13 +387,12 @@ def test_targets_are_lowered_by_what_feeds_them(check_text: CheckText) -> None:
 
 def test_each_target_is_lowered_once(definitions: Definitions, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
-    kind = LoweredTarget
 
-    def counted(label: str, condition: Routine, message: Routine, places: tuple[str, ...]) -> LoweredTarget:
+    def counted(target: Target, condition: Routine, message: Routine, places: tuple[str, ...]) -> Target:
         made.append(places[-1])
-        return kind(label, condition, message, places)
+        return replace(target, condition=condition, message=message, places=places)
 
-    monkeypatch.setattr(sources, "LoweredTarget", counted)
+    monkeypatch.setattr(sources, "replace", counted)
     program = check_table(ROUTES / "rover.yaml", {}, definitions).program
     assert program is not None
     assert made

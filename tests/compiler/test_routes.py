@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedSubscription, Target
 from router.compiler.expressions.tree import Node, Read, Variable
 from router.compiler.plan import Leaf, Record
 from router.errors import Code, Diagnostic, Severity
@@ -223,7 +223,7 @@ routes:
 """
 
 
-def targets(check_text: CheckText, routes: str, priority: str = "") -> tuple[CheckedTarget, CheckedTarget]:
+def targets(check_text: CheckText, routes: str, priority: str = "") -> tuple[Target, Target]:
     said = f"\n    priority: {priority}" if priority else ""
     (route,) = check_text(routes.format(priority=said), endpoints=BOARD_AND_BASE).routes
     board, base = [*route.targets, *(target for feed in route.subscriptions for target in feed.targets)]

@@ -99,7 +99,7 @@ struct lost_event {
 };
 #define NO_NAME UINT32_MAX
 
-/* Where a routine refuses a message: `places` of a LoweredTarget in compiler/lowering. */
+/* Where a routine refuses a message: `places` of a Target in compiler/checked.py. */
 enum place {
     PLACE_MESSAGE,
     PLACE_CONDITION,

@@ -16,7 +16,6 @@ from router.compiler.lowering.lowered import (
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
-    LoweredTarget,
 )
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
@@ -30,7 +29,6 @@ __all__ = [
     "LoweredElements",
     "LoweredFeed",
     "LoweredRoute",
-    "LoweredTarget",
     "lower_condition",
     "lower_table",
 ]

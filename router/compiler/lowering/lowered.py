@@ -5,26 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from router.compiler.checked import Target
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.messages import Place
 from router.compiler.lowering.operations import Routine
 from router.declared import Scalar
-
-
-@dataclass(frozen=True, slots=True)
-class LoweredTarget:
-    """The routines of a target: `condition` for its `when`, and `message`, which writes its message.
-
-    Without a `when`, the condition is empty. A destination of a route from UDP gets the envelope as received, so its
-    `message` is empty. `places` are the places of the table where a message may be rejected, by `enum place` in
-    `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are already checked), the
-    condition, `for_each` or `collect`, and the field of each operation of `message`.
-    """
-
-    label: str
-    condition: Routine
-    message: Routine
-    places: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +33,7 @@ class LoweredCollect:
 class LoweredRoute:
     """The targets of a route by name, and the fields that they read. Slots 0 and 1 are `received_at` and `source`."""
 
-    targets: Mapping[str, LoweredTarget]
+    targets: Mapping[str, Target]
     layout: Layout
     collect: LoweredCollect | None = None
 
@@ -77,7 +62,7 @@ class LoweredFeed:
 
     route: str
     is_urgent: bool
-    targets: Mapping[str, LoweredTarget]
+    targets: Mapping[str, Target]
     layout: Layout
     stamp: tuple[int, int] | None
     for_each: LoweredElements | None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from google.protobuf.descriptor import Descriptor
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
 from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.lowering import lists
@@ -20,7 +20,6 @@ from router.compiler.lowering.lowered import (
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
-    LoweredTarget,
 )
 from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
@@ -93,7 +92,7 @@ class Datagram(_Source):
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
         super().__init__(Section(case.type, descriptor))
 
-    def lowered(self, checked: CheckedRoute, targets: Sequence[CheckedTarget]) -> LoweredRoute:
+    def lowered(self, checked: CheckedRoute, targets: Sequence[Target]) -> LoweredRoute:
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
         collect = checked.collect if targets[0].topic else None
         if collect is None:
@@ -109,12 +108,12 @@ class Datagram(_Source):
         lowered = LoweredCollect(by, count, order, is_text, signed, *_used(frame, by_label.values()))
         return LoweredRoute(by_label, layout, lowered)
 
-    def _target(self, target: CheckedTarget, place: str) -> LoweredTarget:
+    def _target(self, target: Target, place: str) -> Target:
         """Lower a topic, or a destination, which gets the datagram as received."""
         lowering = self.lowering()
         condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
         message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
-        return LoweredTarget(target.label, condition, message, ("", when, place, *places))
+        return replace(target, condition=condition, message=message, places=("", when, place, *places))
 
     def _number(self, node: tree.Node) -> Routine:
         routine = self.lowering().value(node)
@@ -152,7 +151,7 @@ class RosMessage(_Source):
             assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
             message, places = self.sent(lowering, target.plan, checked.case)
             all_places = f"{feed.topic.span}: a malformed message", when, place, *places
-            targets[target.label] = LoweredTarget(target.label, condition, message, all_places)
+            targets[target.label] = replace(target, condition=condition, message=message, places=all_places)
         layout = self.layout(feed.topic.span)
         return LoweredFeed(
             checked.route.name,
@@ -188,7 +187,7 @@ class RosMessage(_Source):
         self.add(Slot(0, tree.INDEX), Slot(0, tree.COUNT))
         return of
 
-    def _elements(self, of: lists.StoredList, targets: Iterable[LoweredTarget]) -> LoweredElements:
+    def _elements(self, of: lists.StoredList, targets: Iterable[Target]) -> LoweredElements:
         item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
         section = item.index if isinstance(item, Section) and item.wanted else NONE
         return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
@@ -218,7 +217,7 @@ def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
     return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
-def _used(variables: Iterable[Meaning], targets: Iterable[LoweredTarget]) -> Iterator[int]:
+def _used(variables: Iterable[Meaning], targets: Iterable[Target]) -> Iterator[int]:
     """Yield the slot of each variable that operations of the targets use, NONE for all others."""
     slots = [operation.slot for target in targets for operation in (*target.condition, *target.message)]
     for variable in variables:

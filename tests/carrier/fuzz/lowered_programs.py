@@ -9,11 +9,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from router.compiler import check_table
-from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
 from router.compiler.expressions import Scope, check
 from router.compiler.expressions.kinds import UINT32, ListKind
 from router.compiler.expressions.tree import COUNT, INDEX, ITEM, Node, Variable
-from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, LoweredTarget, lower_table
+from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute, lower_table
 from router.compiler.lowering.operations import Routine
 from router.compiler.mapping import build
 from router.errors import Located
@@ -107,7 +107,7 @@ def lowered_programs() -> Iterator[Fuzzed]:
     for name, fields, target, when in TO_ROS:
         case = envelope.cases[name]
         scope = Scope(case.type, tuple(schema.enums.values()), ())
-        checked = CheckedTarget(
+        checked = Target(
             Topic(Located("topic", SPAN), SPAN), None, target, _when(when, scope), _plan(fields, target, scope)
         )
         route = CheckedRoute(_route(), case, (checked,))
@@ -119,7 +119,7 @@ def lowered_programs() -> Iterator[Fuzzed]:
         if elements is not None:
             scope = Scope(source, tuple(schema.enums.values()), (), _names(elements))
         plan = _plan(fields, case.type, scope, scope.names.get(ITEM))
-        board = CheckedTarget(Destination(Located("board", SPAN), SPAN), plan=plan, when=_when(when, scope))
+        board = Target(Destination(Located("board", SPAN), SPAN), plan=plan, when=_when(when, scope))
         feed = CheckedSubscription(Topic(Located("topic", SPAN), SPAN), source, None, elements, None, (board,))
         route = CheckedRoute(_route(), case, subscriptions=(feed,))
         yield from _of(_lowered(route), lambda _: _no_seeds, noise, source)
@@ -195,7 +195,7 @@ def _values(declared: Type, noise: random.Random) -> Any:
 # ---- as the assembler has them
 
 
-def _program(route: LoweredRoute | LoweredFeed, target: LoweredTarget) -> Program:
+def _program(route: LoweredRoute | LoweredFeed, target: Target) -> Program:
     for_each = None
     if isinstance(route, LoweredFeed) and route.for_each is not None:
         each = route.for_each
