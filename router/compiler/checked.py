@@ -109,15 +109,6 @@ class CheckedCollect:
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedObeyed:
-    """What shows that a deadman's brake is obeyed: a message of `case` that meets the condition `when`."""
-
-    when: Node
-    case: PayloadCase
-    plan: ObeyedPlan
-
-
-@dataclass(frozen=True, slots=True)
 class CheckedRoute:
     """A route whose payload case exists. If there are errors, it is not compiled.
 
@@ -130,4 +121,7 @@ class CheckedRoute:
     subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
     deadman: DeadmanPlan | None = None
-    obeyed: CheckedObeyed | None = None
+
+    @property
+    def obeyed(self) -> ObeyedPlan | None:
+        return self.deadman.obeyed if self.deadman else None

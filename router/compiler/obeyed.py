@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from router.compiler.checked import CheckedObeyed
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.expressions.tree import Node, Present, Read, parts_of
@@ -18,7 +17,7 @@ LONGEST_WITHIN = 30 * NS_PER_SECOND
 """ns. A rover that takes longer to stop has not obeyed: other values are probably in the wrong unit."""
 
 
-def check_obeyed(lookup: Lookup, route: Route) -> CheckedObeyed | None:
+def check_obeyed(lookup: Lookup, route: Route) -> ObeyedPlan | None:
     """Check what shows that the brake of a route's deadman is obeyed. Return None without it, or with a finding."""
     deadman = route.deadman
     if deadman is None or (obeyed := deadman.obeyed) is None:
@@ -36,7 +35,7 @@ def check_obeyed(lookup: Lookup, route: Route) -> CheckedObeyed | None:
         message = f"this reads no field of '{case.name}', so it shows nothing about the board"
         lookup.report(when.span, Code.BAD_VALUE, message, "compare a field that says how fast the motors turn")
         return None
-    return CheckedObeyed(when, case, ObeyedPlan(case.name, obeyed.within.value, watched))
+    return ObeyedPlan(case, when, obeyed.within.value, watched)
 
 
 def _check_within(lookup: Lookup, deadman: Deadman, obeyed: Obeyed) -> None:

@@ -17,6 +17,7 @@ from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
 if TYPE_CHECKING:
     from router.compiler.checked import Target
+    from router.compiler.expressions.tree import Node
     from router.compiler.lowering import Lowered
 
 STRANGER = None
@@ -66,10 +67,11 @@ class TopicPlan:
 class ObeyedPlan:
     """What shows that a deadman's brake is obeyed: a message of `case` from each of `endpoints`, `within` ns.
 
-    The condition on these messages is among the routines (`Lowered.obeyed`).
+    The message must meet the condition `when`, which is among the routines (`Lowered.obeyed`).
     """
 
-    case: str
+    case: PayloadCase
+    when: Node
     within: int
     endpoints: tuple[str, ...]
 

@@ -104,9 +104,7 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         lookup.findings += [finding for finding in findings if finding]
     checked = (check_outbound if route.is_outbound else check_inbound)(lookup, route, case)
     deadman, obeyed = check_deadman(lookup, route), check_obeyed(lookup, route)
-    if deadman is not None and obeyed is not None:
-        deadman = replace(deadman, obeyed=obeyed.plan)
-    return replace(checked, deadman=deadman, obeyed=obeyed)
+    return replace(checked, deadman=replace(deadman, obeyed=obeyed) if deadman else None)
 
 
 def _sources(lookup: Lookup, route: Route) -> None:

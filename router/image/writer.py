@@ -216,7 +216,7 @@ class _Writer:
     def _witnesses(self, plan: RoutePlan) -> Iterator[c.Witness]:
         """Yield a witness for each deadman that awaits messages of this route, and each endpoint that sends them."""
         for deadman in self.program.deadmen:
-            if deadman.obeyed is not None and deadman.obeyed.case == plan.case.name:
+            if deadman.obeyed is not None and deadman.obeyed.case.name == plan.case.name:
                 yield from (self._witness(deadman, name) for name in deadman.obeyed.endpoints if name in plan.sources)
 
     def _witness(self, deadman: DeadmanPlan, endpoint: str) -> c.Witness:

@@ -123,7 +123,7 @@ def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
             gap = f"no test checks what the deadman of {name} sends to {to.value}"
             yield ("deadman", name, to.value), Item("target", deadman.span, gap)
     if (obeyed := route.obeyed) is not None:
-        for endpoint in obeyed.plan.endpoints:
+        for endpoint in obeyed.endpoints:
             gap = f"no test has {endpoint} obey the deadman of {name}"
             yield ("obeyed", name, endpoint), Item("target", obeyed.when.span, gap)
 
@@ -137,7 +137,7 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
         gap = f"no test has a frame of {name} that stays incomplete"
         yield ("incomplete", name), Item("rejection", collect.span, gap)
     if (obeyed := route.obeyed) is not None:
-        for endpoint in obeyed.plan.endpoints:
+        for endpoint in obeyed.endpoints:
             gap = f"no test has {endpoint} disobey the deadman of {name}"
             yield ("disobeyed", name, endpoint), Item("rejection", obeyed.when.span, gap)
     for target, condition in _with_conditions(route):
