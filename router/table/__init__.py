@@ -25,9 +25,9 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     all valid parts, and `broken` names the others. `environ` defaults to the environment.
     """
     from router.table.build import build_table
-    from router.table.mistakes import cut_findings
     from router.table.shape import check_shape
     from router.table.shorthand import written_out
+    from router.table.yaml_errors import cut_findings
 
     sources: list[Source] = []
     findings: list[Diagnostic] = []

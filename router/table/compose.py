@@ -88,7 +88,7 @@ class _Composer:
                     last = event
                 yield event
         except yaml.MarkedYAMLError as error:
-            from router.table.mistakes import explain
+            from router.table.yaml_errors import explain
 
             raise TableError([explain(error, self._source, self._open_quote(last), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
@@ -245,7 +245,7 @@ class _Composer:
         if event.tag is None:
             return False
 
-        from router.table.mistakes import exclamation
+        from router.table.yaml_errors import exclamation
 
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
         hint = "remove it; to make a value text, quote it"

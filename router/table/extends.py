@@ -17,7 +17,7 @@ from pathlib import Path
 from router import inputs
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean_file, shown_path
 from router.table.compose import compose
-from router.table.hints import as_variable
+from router.table.key_hints import as_variable
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.reading import is_choice

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
-from router.table.fitting import Fits, exact_pattern, fitting
+from router.table.fast_schema import Fits, exact_pattern, fitting
 from router.table.nodes import Node, Path, to_data
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _validator(schema: str) -> Validator:
 
 def validator(schema: Mapping[str, Any]) -> Validator:
     """Return a validator, which finds where data does not fit."""
-    from jsonschema import Draft7Validator, validators  # only for tables with errors: see fitting.py
+    from jsonschema import Draft7Validator, validators  # only for tables with errors: see fast_schema.py
 
     with_exact_end: type[Validator] = validators.extend(Draft7Validator, {"pattern": _pattern})  # type: ignore[no-untyped-call]
     return with_exact_end(schema)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 from router.errors import Code, Diagnostic, SourceSpan, nearest
-from router.table import hints
+from router.table import key_hints
 from router.table.addresses import BadAddressError, parse_address
 from router.table.compose import resolve, truth_of
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten
@@ -168,7 +168,7 @@ def _is_broken(tree: Node, path: Path) -> bool:
 
 def _is_rest(tree: Node, path: Path) -> bool:
     """Return whether the key at `path` is the rest of an expression cut by a comma, which has its own finding."""
-    siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in hints.NAME_FIELDS) else None
+    siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in key_hints.NAME_FIELDS) else None
     return isinstance(siblings, MappingNode) and path[-1] in _rests(siblings)
 
 
@@ -200,12 +200,13 @@ def unknown_keys(
             continue
         written = [key for key, other in entries.items() if other.key.span.file == entry.key.span.file]
         free = [key for key in known if key not in written]
-        advice = hints.behind(name, entry, before) or hints.of_topic(name, entry, entries)
-        advice = advice or hints.for_common_mistake(name, known)
-        hint = advice or hints.for_key(name, entry.value, path, free if hints.meant(name, free) else known, schema)
+        advice = key_hints.behind(name, entry, before) or key_hints.of_topic(name, entry, entries)
+        advice = advice or key_hints.for_common_mistake(name, known)
+        fitting = free if key_hints.meant(name, free) else known
+        hint = advice or key_hints.for_key(name, entry.value, path, fitting, schema)
         if hint not in said:
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
-        said.add(hints.for_common_mistake(name, known) or None)
+        said.add(key_hints.for_common_mistake(name, known) or None)
 
 
 def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
@@ -213,16 +214,16 @@ def _with_known_keys(node: Node, path: Path, known: list[str]) -> Node:
     entries: dict[str, Entry] = {}
     broken = written.broken
     for name, entry in written.entries.items():
-        free = [] if hints.for_common_mistake(name, known) else [key for key in known if key not in written.entries]
-        meant = name if name in known else hints.meant(name, free)
-        is_part = hints.is_topics_of_source(name, path) and not isinstance(entry.value, ScalarNode)
+        free = [] if key_hints.for_common_mistake(name, known) else [key for key in known if key not in written.entries]
+        meant = name if name in known else key_hints.meant(name, free)
+        is_part = key_hints.is_topics_of_source(name, path) and not isinstance(entry.value, ScalarNode)
         if meant is None or (meant != name and meant in entries) or is_part:
             broken = True  # the key's content is lost
         else:
             entries[meant] = entry
-    if any(hints.of_topic(name, entry, written.entries) for name, entry in written.entries.items()):
+    if any(key_hints.of_topic(name, entry, written.entries) for name, entry in written.entries.items()):
         entries["topic"] = replace(entries["topic"], value=_as_broken(entries["topic"].value))
-    if "address" in entries and any(name in written.entries for name in hints.ADDRESS_PARTS):
+    if "address" in entries and any(name in written.entries for name in key_hints.ADDRESS_PARTS):
         entries["address"] = replace(entries["address"], value=_as_broken(entries["address"].value))
     return replace(written, entries=entries, broken=broken)
 
@@ -242,8 +243,8 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
         return _missing_key(error, tree)
     if keyword == "type":
         what = f"{name} {_expected(error)}, not {shown(error.value)}"
-        return Diagnostic(span, Code.WRONG_TYPE, what, hints.for_type(error, tree))
-    if keyword == "pattern" and path[-1] in hints.ADDRESSES:
+        return Diagnostic(span, Code.WRONG_TYPE, what, key_hints.for_type(error, tree))
+    if keyword == "pattern" and path[-1] in key_hints.ADDRESSES:
         return _bad_address(str(error.value), span)
     if keyword == "uniqueItems":
         return _repeated(error, tree)
@@ -251,7 +252,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     if keyword == "maxProperties":
         count = len(error.value) if isinstance(error.value, dict) else 0
         return Diagnostic(span, code, f"{name} has {count} keys; it {_expected(error)}")
-    hint = hints.for_value(error)
+    hint = key_hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
@@ -296,7 +297,7 @@ def _bad_name(error: SchemaError, span: SourceSpan) -> Diagnostic:
 
 def _is_chosen(path: Path) -> bool:
     """Return whether the key at the path is a name chosen by the table, not a key that its siblings exclude."""
-    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in hints.NAME_FIELDS)
+    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in key_hints.NAME_FIELDS)
 
 
 def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
@@ -324,7 +325,7 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
     if is_whole_part and key:
         siblings = mapping(node_at(tree, error.path[:-1])).entries
         extended = [name for name, entry in siblings.items() if entry.key.span.file != key.span.file]
-        hint = f"did you mean '{near}'?" if (near := nearest(key.text, extended, hints.CLOSE)) else hint
+        hint = f"did you mean '{near}'?" if (near := nearest(key.text, extended, key_hints.CLOSE)) else hint
     return Diagnostic(span, Code.MISSING_KEY, f"{subject(error.path)} lacks the key '{missing}'", hint)
 
 
@@ -332,7 +333,7 @@ def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
     try:
         parse_address(text)
     except BadAddressError as error:
-        return Diagnostic(span, Code.BAD_ADDRESS, error.what, hints.as_variable(text) or error.hint)
+        return Diagnostic(span, Code.BAD_ADDRESS, error.what, key_hints.as_variable(text) or error.hint)
     raise AssertionError(f"the schema rejects the address '{text}', parse_address accepts it")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Sequence
 
-from router.compiler.expressions import spellings
+from router.compiler.expressions import foreign_syntax
 from router.compiler.expressions.functions import FUNCTIONS, HAS, Function, Parameter
 from router.compiler.expressions.kinds import FloatKind, fields_hint, is_list
 from router.compiler.expressions.lists import as_kind, as_value, elementwise
@@ -20,7 +20,8 @@ def called_name(node: ast.Call, text: Parsed) -> str:
     """Return the name of the function. Raises ExpressionError unless the call has the form `name(a, b)`."""
     if not isinstance(node.func, ast.Name):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
-        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
+        foreign = foreign_syntax.FUNCTIONS.get(name.lower())
+        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else foreign
         known = "write has(x)" if name == HAS else _of_each(node) or known
         hint = known or did_you_mean("", FUNCTIONS)
         message = "expressions can call only their own functions"
@@ -44,7 +45,7 @@ def _of_each(node: ast.Call) -> str:
 def function_named(name: str, span: SourceSpan) -> Function:
     function = FUNCTIONS.get(name)
     if function is None:
-        hint = spellings.FUNCTIONS.get(name.lower()) or did_you_mean(name, [*FUNCTIONS, HAS])
+        hint = foreign_syntax.FUNCTIONS.get(name.lower()) or did_you_mean(name, [*FUNCTIONS, HAS])
         raise ExpressionError(span, Code.UNKNOWN_FUNCTION, f"there is no function '{name}'", hint)
     return function
 
@@ -108,7 +109,7 @@ def _require_count(function: Function, count: int, span: SourceSpan) -> None:
 
 
 _OF_MORE = {"round": "write round(x * 100) / 100 for two decimals, text(x, 2) for text"}
-_OF_FLOATS = {"int": spellings.INTEGERS, "str": spellings.DECIMALS, "wrap": spellings.WRAPPED}
+_OF_FLOATS = {"int": foreign_syntax.INTEGERS, "str": foreign_syntax.DECIMALS, "wrap": foreign_syntax.WRAPPED}
 
 
 def _require_accepted(function: Function, arguments: Sequence[Node]) -> None:

@@ -6,7 +6,7 @@ import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from router.compiler.expressions import spellings
+from router.compiler.expressions import foreign_syntax
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE
 from router.compiler.expressions.kinds import (
     BoolKind,
@@ -76,7 +76,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
         return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
     hint = (
         _of_an_enum(text, scope, expected)
-        or spellings.NAMES.get(text.lower())
+        or foreign_syntax.NAMES.get(text.lower())
         or (f"quote the name of an endpoint: '{text}'" if text in scope.sources else "")
         or _presence(text, scope)
         or (one_of(_ways(scope, (text,))) if not nearest(text, known, _MISSPELT) else "")
@@ -176,7 +176,7 @@ def is_null(node: ast.expr, scope: Scope) -> bool:
     """Return whether a node is `None`, or `null` and the like without a field of that name."""
     if isinstance(node, ast.Constant):
         return node.value is None
-    return isinstance(node, ast.Name) and node.id.lower() in spellings.NULLS and node.id not in scope.field_names()
+    return isinstance(node, ast.Name) and node.id.lower() in foreign_syntax.NULLS and node.id not in scope.field_names()
 
 
 def no_null(compared: Node, written: str, span: SourceSpan, *, is_equal: bool) -> ExpressionError:
@@ -279,7 +279,7 @@ def _unknown_path(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scop
     if paths := ways(scope.message, path[:1]):
         first = replace(whole, end_column=whole.column + len(path[0]))
         return ExpressionError(first, Code.UNKNOWN_FIELD, message, one_of(paths))
-    hint = spellings.NAMES.get(path[-1].lower(), "")
+    hint = foreign_syntax.NAMES.get(path[-1].lower(), "")
     if not hint and (near := nearest(path[0], fields)) and not nearest(holder_name, enums):
         first = replace(whole, end_column=whole.column + len(path[0]))
         return ExpressionError(first, Code.UNKNOWN_FIELD, message, f"did you mean '{near}'?")

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Collection
 from contextlib import suppress
 
-from router.compiler.expressions import spellings
+from router.compiler.expressions import foreign_syntax
 from router.compiler.expressions.scope import ExpressionError
 from router.errors import Code, SourceSpan
 from router.table.model.expressions import Expression
@@ -47,8 +47,8 @@ class Parsed:
                 return _with_words(ast.parse(text, mode="eval").body)
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
-            hint = self._of_word(text) or spellings.of_syntax(self._expression.text)
-            if slip := spellings.slip(text, self._names):
+            hint = self._of_word(text) or foreign_syntax.of_syntax(self._expression.text)
+            if slip := foreign_syntax.slip(text, self._names):
                 span, reason = self._expression.place.part(*(self._indent + at for at in slip.place)), slip.what
                 hint = slip.hint
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
@@ -167,13 +167,13 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
 
 _WITHOUT_LOOP = "calculate with the whole list, as in x * 2, or with a field of each element, as in x.y * 2"
 _HINTS: dict[type[ast.AST], str] = {
-    ast.Constant: f"write a number, a string, True or False; {spellings.LEFT_OUT}",
-    ast.BitXor: spellings.SQUARE,
-    ast.LShift: spellings.SHIFT,
-    ast.RShift: spellings.SHIFT,
-    ast.BitAnd: spellings.BITS.format("and"),
-    ast.BitOr: spellings.BITS.format("or"),
-    ast.Invert: spellings.BITS.format("not"),
+    ast.Constant: f"write a number, a string, True or False; {foreign_syntax.LEFT_OUT}",
+    ast.BitXor: foreign_syntax.SQUARE,
+    ast.LShift: foreign_syntax.SHIFT,
+    ast.RShift: foreign_syntax.SHIFT,
+    ast.BitAnd: foreign_syntax.BITS.format("and"),
+    ast.BitOr: foreign_syntax.BITS.format("or"),
+    ast.Invert: foreign_syntax.BITS.format("not"),
     ast.Lambda: "write its body alone",
     ast.Dict: "write a map of values without quotes: {map: FIELD, VALUE: ..., else: ...}",
     **dict.fromkeys((ast.ListComp, ast.GeneratorExp, ast.SetComp, ast.DictComp), _WITHOUT_LOOP),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from router.rehearsal.reading import SCHEMA as TESTS
 from router.table.compose import compose
-from router.table.fitting import fitting
+from router.table.fast_schema import fitting
 from router.table.nodes import to_data
 from router.table.schema import SCHEMA, _fits, _validator, validator
 from router.table.source import read_source
