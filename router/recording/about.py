@@ -30,10 +30,10 @@ def about(table: RouteTable, reason: str, tripped: Sequence[str] = ()) -> dict[s
     routes = {
         route.name: RecordedRoute(
             route.case.value,
-            [*(each.value for each in route.sources), *(each.topic.value for each in route.source_topics)],
+            [*(source.value for source in route.sources), *(topic.topic.value for topic in route.source_topics)],
             route.is_outbound,
             route.deadman.timeout.value / 1e6 if route.deadman else 0.0,
-            [each.value for each in route.deadman.to] if route.deadman else [],
+            [to.value for to in route.deadman.to] if route.deadman else [],
         )._asdict()
         for route in table.routes
         if route.ignore is None
@@ -44,14 +44,14 @@ def about(table: RouteTable, reason: str, tripped: Sequence[str] = ()) -> dict[s
 
 def routes_of(metadata: Mapping[str, str]) -> dict[str, RecordedRoute]:
     """Return the routes in the metadata, which old recordings do not have."""
-    found: dict[str, dict[str, Any]] = json.loads(metadata.get("routes", "{}"))
-    return {name: RecordedRoute(**values) for name, values in found.items()}
+    routes: dict[str, dict[str, Any]] = json.loads(metadata.get("routes", "{}"))
+    return {name: RecordedRoute(**values) for name, values in routes.items()}
 
 
 def tripped_in(metadata: Mapping[str, str]) -> list[str]:
     """Return the deadmen that caused the recording, the first one first."""
-    found: list[str] = json.loads(metadata.get("tripped", "[]"))
-    return found
+    tripped: list[str] = json.loads(metadata.get("tripped", "[]"))
+    return tripped
 
 
 def reason_of(tripped: Sequence[str]) -> str:

@@ -98,7 +98,7 @@ class Packer:
         """Return a batch; the clocks are as in `Clock.times`."""
         both = self._packed(datagrams), self._packed(actions)
         times = self._clock.times(wall, monotonic)
-        return Batch(*both, classifier, monotonic, *times, sum(len(each.data) for each in both))
+        return Batch(*both, classifier, monotonic, *times, sum(len(packed.data) for packed in both))
 
     def _packed(self, taken: Taken[T]) -> _Packed[T]:
         return _Packed(self._compressor.compress(taken.records), taken.decode)
@@ -178,15 +178,15 @@ class Encoder:
         """Yield channel and message of a datagram, and of its payload if there is one."""
         datagram = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=endpoint)
         yield self._channels.datagrams(reason), datagram.SerializeToString()
-        if (found := classifier.encoded_payload(listener, data)) is not None:
-            case, payload = found
+        if (encoded := classifier.encoded_payload(listener, data)) is not None:
+            case, payload = encoded
             yield self._channels.view(case, reason), payload
 
     def _action(self, classifier: Classifier, action: Action) -> tuple[int, bytes]:
         """Return channel and message: the payload that was sent, or else an Event."""
         _, what, route, target, topic, reason, detail, data = action
-        if data and not reason and (found := classifier.sent_payload(data)) is not None:
-            case, payload = found
+        if data and not reason and (sent := classifier.sent_payload(data)) is not None:
+            case, payload = sent
             return self._channels.sent(case, what, route, target, topic), payload
         event = Event(what=what, route=route, endpoint=target, ros=topic, reason=reason, detail=detail, data=data)
         return self._channels.events(), event.SerializeToString()

@@ -179,11 +179,11 @@ class Mirror:
 
         def detach() -> None:
             with self._attaching:
-                if not any(each is attached for each in self._observers):
+                if not any(observer is attached for observer in self._observers):
                     return
                 if len(self._observers) == 1:
                     self._end()
-                self._observers = tuple(each for each in self._observers if each is not attached)
+                self._observers = tuple(observer for observer in self._observers if observer is not attached)
                 if not self._observers:
                     self._source.observe(is_observed=False)
                     self._source.take()
@@ -288,8 +288,8 @@ class Classifier:
 
     def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
-        if listener in self._trimming and (found := self._single_field(data)) is not None:
-            return found
+        if listener in self._trimming and (field := self._single_field(data)) is not None:
+            return field
         if (decoded := self.payload(listener, data)) is None:
             return None
         case, payload = decoded
@@ -297,8 +297,8 @@ class Classifier:
 
     def sent_payload(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload of a datagram that the router has sent, perhaps without trailing zeros."""
-        if (found := self._single_field(data)) is not None:
-            return found
+        if (field := self._single_field(data)) is not None:
+            return field
         try:
             envelope = self.envelope.message_class.FromString(restored(data))
         except ProtobufError:

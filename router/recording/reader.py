@@ -29,7 +29,7 @@ from router.types.wire import LEN, varint
 
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
 """Errors in files that no recorder wrote; lz4, which `mcap recover` may have used, raises RuntimeError."""
-_OURS = frozenset(each.value for each in Holds)
+_OURS = frozenset(held.value for held in Holds)
 
 
 class Recorded(NamedTuple):
@@ -106,7 +106,7 @@ class Recording:
 
     def datagrams(self) -> Iterator[Recorded]:
         """Yield each datagram once, until the end of the file or damage."""
-        return (each for each in self.everything() if isinstance(each, Recorded))
+        return (record for record in self.everything() if isinstance(record, Recorded))
 
     def everything(self) -> Iterator[Recorded | RecordedAction]:
         """Yield each datagram and each action once, until the end of the file or damage.
@@ -117,12 +117,12 @@ class Recording:
             for record in self._records:
                 if not isinstance(record, Message):
                     self._take(record)
-                elif (found := self._decoders[record.channel_id](record.log_time, record.data)) is None:
+                elif (decoded := self._decoders[record.channel_id](record.log_time, record.data)) is None:
                     continue
-                elif isinstance(found, Action):
-                    yield RecordedAction(record.publish_time, found)
+                elif isinstance(decoded, Action):
+                    yield RecordedAction(record.publish_time, decoded)
                 else:
-                    yield Recorded(record.log_time, record.publish_time, *found)
+                    yield Recorded(record.log_time, record.publish_time, *decoded)
         except _DAMAGED:
             pass
         self.ends_early = not self.is_whole
@@ -137,7 +137,7 @@ class Recording:
         """Return the payload cases of the channels outside chunks, or of all channels."""
         with self.path.open("rb") as file:
             schemas: dict[int, Schema] = {}
-            found: dict[tuple[str, int], RecordedCase] = {}
+            cases: dict[tuple[str, int], RecordedCase] = {}
             try:
                 for record in StreamReader(file, emit_chunks=emit_chunks, record_size_limit=self.size).records:
                     if isinstance(record, Schema):
@@ -145,10 +145,10 @@ class Recording:
                     elif isinstance(record, Channel) and "number" in record.metadata:
                         case, schema = record.topic.rpartition("/")[2], schemas[record.schema_id]
                         number = int(record.metadata["number"])
-                        found.setdefault((case, number), RecordedCase(case, number, schema.name, schema.data))
+                        cases.setdefault((case, number), RecordedCase(case, number, schema.name, schema.data))
             except _DAMAGED:
                 pass
-        return [*found.values()]
+        return [*cases.values()]
 
     def _take(self, record: McapRecord) -> None:
         if isinstance(record, Channel):

@@ -330,9 +330,9 @@ class Recorder:
             logger.error("cannot save the last datagrams", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
         except Exception as error:
-            found = fault(error, "prevented saving", "the recorder")
-            found.log()
-            raise RecordError(f"{found.event}: {error!r}") from error
+            stopped = fault(error, "prevented saving", "the recorder")
+            stopped.log()
+            raise RecordError(f"{stopped.event}: {error!r}") from error
 
     def _encoded(self, about: Mapping[str, str]) -> tuple[bytes, int]:
         """Return a whole file of what is in memory, and the number of its datagrams.

@@ -43,7 +43,7 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
         )
     pool.AddSerializedFile(own.SerializeToString())
     types, _ = build_types(pool, [*files], {}, lambda _: NO_OPTIONS)
-    made = {
+    payload_cases = {
         case.name: PayloadCase(
             case.name,
             number,
@@ -53,4 +53,4 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
         )
         for number, case in sorted(named.items())
     }
-    return Envelope(_NAME, _ONEOF, GetMessageClass(pool.FindMessageTypeByName(_NAME)), made, 0)
+    return Envelope(_NAME, _ONEOF, GetMessageClass(pool.FindMessageTypeByName(_NAME)), payload_cases, 0)

@@ -272,8 +272,8 @@ def _numbered(path: Path, stem: str) -> Iterator[tuple[int, Path]]:
         re.escape(stem) + r"_(\d{6,})_\d{8}T\d{6}\.\d{6}Z(?:_[a-z0-9_.-]+)?" + re.escape(SUFFIX), re.ASCII
     )
     for file in path.iterdir() if path.is_dir() else ():
-        if found := name.fullmatch(file.name):
-            yield int(found[1]), file
+        if match := name.fullmatch(file.name):
+            yield int(match[1]), file
 
 
 class ContinuousWriter:

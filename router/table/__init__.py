@@ -69,7 +69,7 @@ def http_address(path: Path, environ: Mapping[str, str]) -> Address | None:
 
 def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:
     """Return each finding once, in the order of the files."""
-    return sorted(dict.fromkeys(findings), key=lambda found: (found.span, found.code.value, found.message))
+    return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))
 
 
 def summary(table: RouteTable) -> str:

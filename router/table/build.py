@@ -112,8 +112,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         endpoints=builder.each(root, "endpoints", _named(Endpoint)),
         routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
         routes_span=routes.key.span if routes else None,
-        gateways={name: each for name, each in gateways.items() if isinstance(each, Gateway)},
-        ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
+        gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, Gateway)},
+        ignored_gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, IgnoredGateway)},
         broken=frozenset(builder.broken),
         record=builder.one(root, "record", _record),
         foxglove=builder.one(root, "foxglove", _server),
@@ -214,16 +214,16 @@ def _read(key: Key, node: Node, span: SourceSpan) -> object:
     return Located(value, node.span) if key.is_located else value
 
 
-def _scalar_value(key: Key, found: ScalarNode) -> object:
+def _scalar_value(key: Key, node: ScalarNode) -> object:
     if key.quantity is not None:
-        return parsed(key.quantity.parse, Located(found.value, found.span))
+        return parsed(key.quantity.parse, Located(node.value, node.span))
     if key.type is bool:
-        return found.value is True
+        return node.value is True
     if key.type is int:
-        return whole(found)
+        return whole(node)
     if key.type is Path:
-        return beside(found.text, found.span)
-    return key.type(found.text) if issubclass(key.type, enum.Enum) else found.text
+        return beside(node.text, node.span)
+    return key.type(node.text) if issubclass(key.type, enum.Enum) else node.text
 
 
 # keys of the root
@@ -304,8 +304,10 @@ def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
         name=case.text,
         span=span,
         case=Located(case.text, case.span),
-        sources=tuple(located(each) for each in sources if isinstance(each, ScalarNode)),
-        source_topics=tuple(_topic(each, _item_span(each)) for each in sources if isinstance(each, MappingNode)),
+        sources=tuple(located(source) for source in sources if isinstance(source, ScalarNode)),
+        source_topics=tuple(
+            _topic(source, _item_span(source)) for source in sources if isinstance(source, MappingNode)
+        ),
         deadman=None,
     )
     entry = settings.entries.get("deadman")
@@ -313,7 +315,7 @@ def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
         return route
     if reason := optional_text(mapping(entry.value), "none"):
         return replace(route, no_deadman=reason.value)
-    return replace(route, deadman=_deadman(entry, tuple(each.endpoint for each in route.destinations)))
+    return replace(route, deadman=_deadman(entry, tuple(to.endpoint for to in route.destinations)))
 
 
 def _without_ttl(settings: MappingNode) -> Mapping[str, str | None]:
@@ -334,7 +336,7 @@ def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
     """
     cases = tuple(cases)
     taken = {route.name for routes in cases for route in routes}
-    found: list[Route] = []
+    named: list[Route] = []
     for routes in cases:
         for route in routes:
             name = (
@@ -343,8 +345,8 @@ def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
                 else _free(f"{route.name}_from_{route.sources[0].value if route.sources else ROS}", taken)
             )
             taken.add(name)
-            found.append(replace(route, name=name))
-    return tuple(found)
+            named.append(replace(route, name=name))
+    return tuple(named)
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -370,7 +372,7 @@ def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
     """Build the deadman of a route. Without `to`, its payloads go to the route's destinations."""
     settings = _with_timeout(entry)
     payloads = tuple(
-        Payload(located(each.key), _constants(each)) for each in mapping(settings.get("send")).entries.values()
+        Payload(located(payload.key), _constants(payload)) for payload in mapping(settings.get("send")).entries.values()
     )
     own = {} if settings.get("to") else {"to": destinations}
     return structure(Deadman, settings, span=entry.key.span, payloads=payloads, **own)
@@ -417,8 +419,8 @@ def _expression(node: Node, span: SourceSpan) -> Expression:
         return replace(_expression(node.entries[TEXT].value, span), literal=True)
     if isinstance(node, SequenceNode):
         return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
-    found = scalar(node)
-    return Expression(found.text, found.place)
+    written = scalar(node)
+    return Expression(written.text, written.place)
 
 
 def _fields(node: Node, span: SourceSpan) -> FieldMap:
@@ -519,9 +521,9 @@ def _pattern(node: Node, _: SourceSpan) -> TopicPattern:
 
 def _rates(node: Node | None) -> Iterator[TopicRate]:
     for entry in mapping(node).entries.values() if node else ():
-        found = scalar(entry.value)
+        rate = scalar(entry.value)
         pattern = TopicPattern(entry.key.text, is_regex=False, span=entry.key.span)
-        yield TopicRate(pattern, parsed(TOPIC_RATE.parse, Located(found.value, found.span)))
+        yield TopicRate(pattern, parsed(TOPIC_RATE.parse, Located(rate.value, rate.span)))
 
 
 def _inbound(node: Node, span: SourceSpan) -> Inbound:

@@ -165,10 +165,10 @@ class _Composer:
             )
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken, is_filled)
-        if found := surprise(text):
+        if odd := surprise(text):
             # Shows a variable by name, since its value may be secret.
-            what = f"some YAML parsers read '{event.value}' as {found.meaning}, others do not"
-            remedy = f"{found.remedy}; for text, " if found.remedy and not self._is_key() else ""
+            what = f"some YAML parsers read '{event.value}' as {odd.meaning}, others do not"
+            remedy = f"{odd.remedy}; for text, " if odd.remedy and not self._is_key() else ""
             hint = f'{remedy}quote it: "{event.value}"'
             if (key := self._key()) in REASONS and truth_of(text) is not None:
                 hint = SAY_WHY.format(key)
@@ -251,8 +251,8 @@ class _Composer:
         hint = "remove it; to make a value text, quote it"
         if "include" in name:
             hint = "put what tables share into one table, which the others name in `extends: FILE`"
-        if (found := exclamation(self._source, span.line - 1)) is not None:
-            self._findings.append(found)
+        if (finding := exclamation(self._source, span.line - 1)) is not None:
+            self._findings.append(finding)
             return True
         return self._report(span, f"tables do not support the tag '{name}'", hint)
 
@@ -357,4 +357,4 @@ def surprise(text: str) -> Surprise | None:
     """Return how YAML 1.1 interprets a plain scalar differently from YAML 1.2; None if it does not."""
     if text[:1] not in _NUMBERS:
         return _WORD_SURPRISES.get(text)
-    return next((found for pattern, found in _NUMBER_SURPRISES if pattern.fullmatch(text)), None)
+    return next((odd for pattern, odd in _NUMBER_SURPRISES if pattern.fullmatch(text)), None)

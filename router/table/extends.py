@@ -102,7 +102,7 @@ def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
 def _takes_topics(route: MappingNode) -> bool:
     source = route.get("source")
     sources = source.items if isinstance(source, SequenceNode) else (source,)
-    return any(isinstance(each, MappingNode) for each in sources)
+    return any(isinstance(source, MappingNode) for source in sources)
 
 
 def _root_mapping(root: Node) -> MappingNode:
@@ -139,10 +139,10 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
     try:
         return read_source(path)
     except TableError as error:
-        found = error.diagnostics[0]
-        if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
+        finding = error.diagnostics[0]
+        if finding.code is not Code.BAD_FILE or finding.span.end_column > finding.span.column:
             raise  # the file exists, but something in it is wrong
-        what = f"'{reference.text}' cannot be extended: {found.message.removeprefix(UNREADABLE)}"
+        what = f"'{reference.text}' cannot be extended: {finding.message.removeprefix(UNREADABLE)}"
         place = f"correct the path: it leads to {shown_path(Path(inputs.real_path(path)))}"
         hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or place
         raise TableError.of(reference.span, Code.BAD_EXTENDS, what, hint) from error

@@ -32,13 +32,13 @@ class _Maker:
             return lambda _: schema
         if "$ref" in schema:  # other keywords beside it are ignored
             return self._reference(schema["$ref"].removeprefix("#/definitions/"))
-        found = [_KEYWORDS[keyword](self, limit, schema) for keyword, limit in schema.items() if keyword in _KEYWORDS]
+        checks = [_KEYWORDS[keyword](self, limit, schema) for keyword, limit in schema.items() if keyword in _KEYWORDS]
         if unknown := schema.keys() - _KEYWORDS.keys() - _OTHERS:
             raise NotImplementedError(f"the schema uses {', '.join(sorted(unknown))}")
-        return found[0] if len(found) == 1 else _all_of(found)
+        return checks[0] if len(checks) == 1 else _all_of(checks)
 
     def all(self, schemas: Collection[Any]) -> list[Fits]:
-        return [self.of(each) for each in schemas]
+        return [self.of(schema) for schema in schemas]
 
     def _reference(self, name: str) -> Fits:
         """Return the check of a definition, made on first use because it may refer to itself."""
@@ -109,7 +109,7 @@ _TYPES: Mapping[str, Fits] = {
 
 def _is_one_of(limits: Collection[Any]) -> Fits:
     """Check that a value is one of these scalars. True does not equal 1."""
-    return lambda value: any(value == each and isinstance(value, bool) is isinstance(each, bool) for each in limits)
+    return lambda value: any(value == limit and isinstance(value, bool) is isinstance(limit, bool) for limit in limits)
 
 
 def exact_pattern(pattern: str) -> str:
@@ -123,7 +123,7 @@ def _pattern(limit: str) -> Fits:
 
 
 def _are_unique(items: list[Any]) -> bool:
-    return not any(each in items[:index] for index, each in enumerate(items))
+    return not any(item in items[:index] for index, item in enumerate(items))
 
 
 def _of(kind: str, make: Callable[[Any], Fits]) -> Callable[[_Maker, Any, Mapping[str, Any]], Fits]:

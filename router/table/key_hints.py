@@ -195,9 +195,9 @@ def _owners(name: str, path: Path) -> str:
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
     ]
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
-    places = [_PLACES[owner] for owner in near]
-    places += ["the top level"] if name in keys_of(table_schema()) else []
-    return f"move it to {', or to '.join(places)}" if places else ""
+    named = [_NAMES[owner] for owner in near]
+    named += ["the top level"] if name in keys_of(table_schema()) else []
+    return f"move it to {', or to '.join(named)}" if named else ""
 
 
 _OF_PART = {
@@ -205,7 +205,7 @@ _OF_PART = {
     "gateways": ("gateway", "inbound", "transport", "zenoh", "topic_pattern", "inbound_deadman"),
 }
 """Definitions where a key belongs that is misplaced in this part of a table."""
-_PLACES = {
+_NAMES = {
     "route": "the route",
     "destination": "an item of 'destinations'",
     "topic": "an item of 'topics'",
@@ -271,9 +271,9 @@ def _locator(value: str, error: SchemaError) -> str:
 
 
 def _meant_quantity(text: str, pattern: str) -> str:
-    if not (meant := meant_quantity(text, lambda each: matches(each, pattern))) or not matches(EACH, pattern):
+    if not (meant := meant_quantity(text, lambda quantity: matches(quantity, pattern))) or not matches(EACH, pattern):
         return meant
-    supported = meant_quantity(text, lambda each: matches(each, pattern) and _is_supported(each))
+    supported = meant_quantity(text, lambda quantity: matches(quantity, pattern) and _is_supported(quantity))
     return supported or _MOST_OFTEN[matches("1 Hz", pattern)]
 
 
@@ -355,7 +355,7 @@ def for_type(error: SchemaError, tree: Node) -> str:
     if name in REASONS:
         return SAY_WHY.format(name)
     if said := next(
-        (hint for (place, word), hint in _WORDS.items() if word == value and _is_at(error.path, place)), ""
+        (hint for (pattern, word), hint in _WORDS.items() if word == value and _is_at(error.path, pattern)), ""
     ):
         return said
     if error.is_list_in_list:
@@ -403,7 +403,7 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
         return _case_or_field(name, value)
     if (written := _in_flow(value)) is None:
         return ""
-    if instead := next((text for place, text in _INSTEAD.items() if _is_at(error.path, place)), ""):
+    if instead := next((text for pattern, text in _INSTEAD.items() if _is_at(error.path, pattern)), ""):
         if isinstance(value, list) and "[" not in instead:
             return ""
         text = instead.format(f"IP:{written}" if isinstance(value, int) and "address: {0}" in instead else written)
@@ -489,8 +489,8 @@ def _with_unit(error: SchemaError, value: object) -> str:
     pattern = str(error.schema.get("pattern", ""))
     if not pattern or not isinstance(value, (int, float)) or matches(str(value), pattern):
         return ""
-    written = [each for unit in ("ms", "s", "B", "B/s") if matches(each := f"{value}{unit}", pattern)]
-    return " or ".join((f"write `{written[0]}`", *(f"`{each}`" for each in written[1:]))) if written else ""
+    written = [quantity for unit in ("ms", "s", "B", "B/s") if matches(quantity := f"{value}{unit}", pattern)]
+    return " or ".join((f"write `{written[0]}`", *(f"`{quantity}`" for quantity in written[1:]))) if written else ""
 
 
 def _for_fields(items: list[object]) -> str:
@@ -510,8 +510,8 @@ _ASSIGNMENT = re.compile(r"([\w.]+)(?:\s*[=:]\s*(\S.*))?")
 """A field's name, perhaps with an expression."""
 
 
-def _is_at(path: Path, place: Path) -> bool:
-    return len(path) == len(place) and all(one in ("*", step) for one, step in zip(place, path, strict=True))
+def _is_at(path: Path, pattern: Path) -> bool:
+    return len(path) == len(pattern) and all(one in ("*", step) for one, step in zip(pattern, path, strict=True))
 
 
 def _in_flow(value: object) -> str | None:

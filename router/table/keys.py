@@ -118,10 +118,10 @@ _KEYS: dict[type, tuple[Key, ...]] = {}
 def _key(field: Field[Any], hint: Any) -> Key:
     marks: dict[type, Any] = {}
     if get_origin(hint) is Annotated:
-        hint, *found = get_args(hint)
-        marks = {type(mark): mark for mark in found}
+        hint, *annotated = get_args(hint)
+        marks = {type(mark): mark for mark in annotated}
     if get_origin(hint) in (Union, UnionType):
-        hint = next(each for each in get_args(hint) if each is not type(None))
+        hint = next(option for option in get_args(hint) if option is not type(None))
     if is_list := get_origin(hint) is tuple:
         hint = get_args(hint)[0]
     if is_located := get_origin(hint) is Located:

@@ -62,8 +62,8 @@ def sequence(node: Node | None) -> SequenceNode:
 
 def located(node: Node | None) -> Located[str]:
     """Return the text of a scalar as written."""
-    found = scalar(node)
-    return Located(found.text, found.span)
+    written = scalar(node)
+    return Located(written.text, written.span)
 
 
 def beside(text: str, span: SourceSpan) -> Path:
@@ -73,10 +73,10 @@ def beside(text: str, span: SourceSpan) -> Path:
 
 def whole(node: Node | None) -> int:
     """Return a whole number; YAML's 10.0 and 1e1 are also whole."""
-    found = scalar(node)
-    if isinstance(found.value, bool) or not isinstance(found.value, (int, float)):
-        raise TypeError(f"a whole number, not {found.value!r}")
-    return int(found.value)
+    number = scalar(node)
+    if isinstance(number.value, bool) or not isinstance(number.value, (int, float)):
+        raise TypeError(f"a whole number, not {number.value!r}")
+    return int(number.value)
 
 
 def optional_text(settings: MappingNode, key: str) -> Located[str] | None:

@@ -94,9 +94,9 @@ def schema_errors(tree: Node, schema: str) -> list[SchemaError]:
     data: Any = to_data(tree)
     if _fits(schema)(data):
         return []
-    found = [SchemaError.of(error) for error in _validator(schema).iter_errors(data)]
-    found.sort(key=lambda error: error.keyword != "type")
-    first = {(error.path, error.message if error.is_about_keys else ""): error for error in reversed(found)}
+    errors = [SchemaError.of(error) for error in _validator(schema).iter_errors(data)]
+    errors.sort(key=lambda error: error.keyword != "type")
+    first = {(error.path, error.message if error.is_about_keys else ""): error for error in reversed(errors)}
     return list(first.values())
 
 

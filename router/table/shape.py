@@ -51,33 +51,33 @@ _HINT_FOR_WHOLE = "write 'envelope', 'listen' and 'routes'; or, for a table with
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """Return the tree with misspelt keys corrected and everything that has a finding marked broken."""
-    found = schema_errors(root, SCHEMA)
-    filled = {error.path: partial(_as_taken, kinds=error.limit) for error in found if _is_filled(error, root)}
+    errors = schema_errors(root, SCHEMA)
+    filled = {error.path: partial(_as_taken, kinds=error.limit) for error in errors if _is_filled(error, root)}
     if filled:
         root = mapping(rewritten(root, filled))
-        found = schema_errors(root, SCHEMA)
-    if not found:
+        errors = schema_errors(root, SCHEMA)
+    if not errors:
         return root
-    tree = _with_deep_keys(root, {error.path[:2] for error in found}, findings)
+    tree = _with_deep_keys(root, {error.path[:2] for error in errors}, findings)
     if tree is not root:
-        found = schema_errors(tree, SCHEMA)
-    while unknown := [error for error in found if error.keyword == "additionalProperties"]:
+        errors = schema_errors(tree, SCHEMA)
+    while unknown := [error for error in errors if error.keyword == "additionalProperties"]:
         repairs = {}
-        empty = {error.path for error in found if error.lacks_mapping}
+        empty = {error.path for error in errors if error.lacks_mapping}
         for error in unknown:
             known = list(error.schema["properties"])
             findings.extend(unknown_keys(tree, error.path, known, subject(error.path), empty))
             repairs[error.path] = partial(_with_known_keys, path=error.path, known=known)
         tree = rewritten(tree, repairs)
-        found = schema_errors(tree, SCHEMA)
-    rests = {error.path for error in found if _is_rest(tree, error.path)}
-    found = [error for error in found if error.path not in rests]
-    _explain_words(found, tree, findings)
-    implied = _consequences(found)
+        errors = schema_errors(tree, SCHEMA)
+    rests = {error.path for error in errors if _is_rest(tree, error.path)}
+    errors = [error for error in errors if error.path not in rests]
+    _explain_words(errors, tree, findings)
+    implied = _consequences(errors)
     findings.extend(
-        finding(error, tree) for error in found if error not in implied and not _is_broken(tree, error.path)
+        finding(error, tree) for error in errors if error not in implied and not _is_broken(tree, error.path)
     )
-    tree = rewritten(tree, {error.path: _as_broken for error in found})
+    tree = rewritten(tree, {error.path: _as_broken for error in errors})
     return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
 
 
@@ -89,14 +89,14 @@ def _is_filled(error: SchemaError, tree: Node) -> bool:
 
 def _as_taken(node: Node, kinds: str | list[str]) -> Node:
     """Return a scalar from a variable with the value that a key for `kinds` of values takes, quoted or not."""
-    found = scalar(node)
-    return replace(found, value=found.text if "string" in kinds else resolve(found.text))
+    written = scalar(node)
+    return replace(written, value=written.text if "string" in kinds else resolve(written.text))
 
 
-def _explain_words(found: list[SchemaError], tree: Node, findings: list[Diagnostic]) -> None:
+def _explain_words(errors: list[SchemaError], tree: Node, findings: list[Diagnostic]) -> None:
     """Replace the finding for an ambiguous word, such as `yes`, that is wrong as a truth value and as text."""
-    ambiguous = {each.span: index for index, each in enumerate(findings) if each.code is Code.AMBIGUOUS_SCALAR}
-    for error in found:
+    ambiguous = {earlier.span: index for index, earlier in enumerate(findings) if earlier.code is Code.AMBIGUOUS_SCALAR}
+    for error in errors:
         node = None if error.about_name or error.is_about_keys else node_at(tree, error.path)
         if not isinstance(node, ScalarNode) or node.span not in ambiguous or "boolean" in str(error.limit):
             continue
@@ -140,19 +140,19 @@ def _above(entry: Entry, entries: Mapping[str, Entry]) -> str | None:
     return above[max(lines)] if (lines := [line for line in above if line < span.line]) else None
 
 
-def _consequences(found: list[SchemaError]) -> list[SchemaError]:
+def _consequences(errors: list[SchemaError]) -> list[SchemaError]:
     """Return errors that are consequences of another one, which is reported.
 
     These are all but the first of several lists in a list, and errors below `send` if it has several payload cases or
     one without fields.
     """
-    empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
+    empty = [error.path for error in errors if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
-    consequences = [error for error in found if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
-    several = [error.path for error in found if error.keyword == "maxProperties" and error.path[-1] == "send"]
-    consequences += [error for error in found if error.path[:-1] in several and error.path[:-1] not in groups]
+    consequences = [error for error in errors if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
+    several = [error.path for error in errors if error.keyword == "maxProperties" and error.path[-1] == "send"]
+    consequences += [error for error in errors if error.path[:-1] in several and error.path[:-1] not in groups]
     rows: dict[Path, SchemaError] = {}
-    lists = [error for error in found if error.is_list_in_list]
+    lists = [error for error in errors if error.is_list_in_list]
     consequences += [error for error in lists if rows.setdefault(error.path[:-1], error) is not error]
     return consequences
 

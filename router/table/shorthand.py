@@ -48,7 +48,7 @@ class _Shorthand:
         if topic is not None:
             others = {key: entry for key, entry in node.entries.items() if key != "topic"}
             node = replace(node, entries={**others, "topics": topic})
-        node = _changed(node, "topics", lambda topics: _one_or_each(topics, lambda each: self._topic(_named(each))))
+        node = _changed(node, "topics", lambda topics: _one_or_each(topics, lambda topic: self._topic(_named(topic))))
         node = _changed(node, "source", lambda source: _one_or_each(source, self._topic))
         return _with(_changed(node, "deadman", self._deadman), self._of_routes)
 

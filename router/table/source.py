@@ -71,8 +71,8 @@ def foreign_blank(text: str) -> str | None:
     """Return the name of the first character that looks like a space, or is invisible, but is not a space in YAML."""
     if text.isascii():
         return None
-    found = next((char for char in text if unicodedata.category(char) in ("Zs", "Cf") and char != " "), None)
-    return f"U+{ord(found):04X}" if found else None
+    blank = next((char for char in text if unicodedata.category(char) in ("Zs", "Cf") and char != " "), None)
+    return f"U+{ord(blank):04X}" if blank else None
 
 
 def _read(path: Path, file: str) -> bytes:

@@ -105,8 +105,8 @@ _CONVERTED: Mapping[str, tuple[Fraction | int, str]] = {
 
 def meant_quantity(text: str, fits: Callable[[str], bool]) -> str:
     """Return `did you mean '4MB' or '4MiB'?` for the quantities that the text may stand for and that fit, or empty."""
-    found = [f"'{each}'" for each in dict.fromkeys(_meanings(text)) if fits(each)]
-    return f"did you mean {' or '.join(found)}?" if found else ""
+    meant = [f"'{quantity}'" for quantity in dict.fromkeys(_meanings(text)) if fits(quantity)]
+    return f"did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _meanings(text: str) -> Iterator[str]:
@@ -134,11 +134,11 @@ def _meanings(text: str) -> Iterator[str]:
 def _units(written: str) -> list[tuple[Fraction | int, str]]:
     """Return what a unit may stand for, as multiples of units of tables. A `/s` may be missing or superfluous."""
     for word in (written, written.removesuffix("s")):
-        found = [_CONVERTED[word]] if word in _CONVERTED else []
-        found += [(1, unit) for unit, spellings in _SPELLINGS.items() if word in spellings]
+        units = [_CONVERTED[word]] if word in _CONVERTED else []
+        units += [(1, unit) for unit, spellings in _SPELLINGS.items() if word in spellings]
         sizes = [unit for unit in DISK_BYTES if word.removesuffix("/s") in _SPELLINGS[unit]]
-        if found := [*found, *((1, f"{unit}{end}") for unit in sizes for end in ("", "/s"))]:
-            return found
+        if units := [*units, *((1, f"{unit}{end}") for unit in sizes for end in ("", "/s"))]:
+            return units
     return []
 
 
@@ -184,7 +184,7 @@ def parse_topic_rate(value: str | float) -> int:
 
 def _meaning(text: str, *units: str) -> str:
     """Return `; did you mean '200ms'?` if the text may be a quantity with one of the units, else empty."""
-    meant = meant_quantity(text, lambda each: each != text and each.lstrip("0123456789. ") in units)
+    meant = meant_quantity(text, lambda quantity: quantity != text and quantity.lstrip("0123456789. ") in units)
     return f"; {meant}" if meant else ""
 
 

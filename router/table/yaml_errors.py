@@ -338,10 +338,11 @@ def _neighbours(source: Source, line: int) -> list[int]:
     for number in reversed(range(line)):
         if _text(source, number):
             at = {_keys_at(source, number), _indent(source.lines[number])}
-            open_at += sorted((each for each in at if not open_at or each < open_at[-1]), reverse=True)
+            open_at += sorted((indent for indent in at if not open_at or indent < open_at[-1]), reverse=True)
     if own in open_at:
         return []
-    return [*[each for each in open_at if each > own][-1:], *[each for each in open_at if each < own][:1]]
+    deeper, shallower = ([indent for indent in open_at if indent > own], [indent for indent in open_at if indent < own])
+    return [*deeper[-1:], *shallower[:1]]
 
 
 def _misplaced(source: Source, line: int, neighbours: list[int]) -> Diagnostic:

@@ -32,7 +32,7 @@ def table_schema() -> Schema:
 
 def _by_name(definition: str, reserved: Sequence[str]) -> Schema:
     """Return the schema of a mapping with names that the table chooses."""
-    *others, last = (f"'{each}'" for each in reserved)
+    *others, last = (f"'{name}'" for name in reserved)
     return {
         "type": "object",
         "propertyNames": {

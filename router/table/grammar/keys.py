@@ -92,20 +92,20 @@ def properties(model: type, **given: Any) -> Schema:
     around it, which is given without its keys.
     """
     docs = _docs(model)
-    found: Schema = {}
+    schemas: Schema = {}
     own_first = sorted(keys_of(model), key=lambda key: key.attribute not in model.__annotations__)
-    for each in own_first:
-        outer, _, name = each.name.rpartition(".")
-        text, other = docs.get(each.attribute), given.get(each.name)
+    for declared in own_first:
+        outer, _, name = declared.name.rpartition(".")
+        text, other = docs.get(declared.attribute), given.get(declared.name)
         if isinstance(other, dict):
-            found[name] = other
-        elif text is None and each.type not in _DESCRIBED:
+            schemas[name] = other
+        elif text is None and declared.type not in _DESCRIBED:
             continue
         elif outer:
-            found.setdefault(outer, mapping({}, **given[outer]))["properties"][name] = _property(each, name, text)
+            schemas.setdefault(outer, mapping({}, **given[outer]))["properties"][name] = _property(declared, name, text)
         else:
-            found[name] = _property(each, name, text, other)
-    return found
+            schemas[name] = _property(declared, name, text, other)
+    return schemas
 
 
 def _property(key: Key, name: str, text: str | None, other: str | None = None) -> Schema:
@@ -140,25 +140,25 @@ def _shown(shown: Schema, value: Schema) -> Schema:
 def _documented(text: str) -> Schema:
     """Return what a docstring says: the description, and what the lines with labels add."""
     text = inspect.cleandoc(text)
-    found: Schema = {"description": " ".join(text.partition("\n\n")[0].split())}
+    shown: Schema = {"description": " ".join(text.partition("\n\n")[0].split())}
     for label, lines in _LABEL.findall(text):
         said = " ".join(lines.split())
         if label == "Example":
-            found.setdefault("examples", []).append(yaml.safe_load(said))
+            shown.setdefault("examples", []).append(yaml.safe_load(said))
         else:
-            found["title" if label == "Title" else "errorMessage"] = said
-    return found
+            shown["title" if label == "Title" else "errorMessage"] = said
+    return shown
 
 
 def _docs(model: type) -> dict[str, str]:
     """Return the docstrings of the fields of a class, also of those that it inherits, by name."""
-    found: dict[str, str] = {}
-    for each in filter(is_dataclass, reversed(model.__mro__)):
-        for declared in ast.parse(inspect.getsource(each)).body:
+    docs: dict[str, str] = {}
+    for owner in filter(is_dataclass, reversed(model.__mro__)):
+        for declared in ast.parse(inspect.getsource(owner)).body:
             for field, text in pairwise(getattr(declared, "body", ())):
                 if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                    found[ast.unparse(field.target)] = ast.literal_eval(text.value)
-    return found
+                    docs[ast.unparse(field.target)] = ast.literal_eval(text.value)
+    return docs
 
 
 def _value(key: Key) -> Schema:
@@ -185,7 +185,7 @@ def _item(key: Key) -> Schema:
     if isinstance(kind, str):
         return ref(kind)
     if issubclass(kind, enum.Enum):
-        return {"type": "string", "enum": [each.value for each in kind]}
+        return {"type": "string", "enum": [word.value for word in kind]}
     return ref(_DEFINED.get(kind) or _words(kind))
 
 

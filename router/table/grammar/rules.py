@@ -145,7 +145,7 @@ _LIMITS = {"udp": [_NO_CLIENTS], "tcp": [_NO_RECEIVE], "websocket": [_NO_RECEIVE
 def _of_transport(name: str, formats: Mapping[str, str]) -> Schema:
     """Return the rule for gateways with a transport: which formats fit, and which keys do not."""
     default = DEFAULT_FORMATS[Transport(name)].value
-    meanings = "; ".join(f"{each}: {meaning}" for each, meaning in formats.items())
+    meanings = "; ".join(f"{word}: {meaning}" for word, meaning in formats.items())
     chosen = key(
         "Format", f"The format that clients read. {meanings}.", {"default": default, "enum": [*formats]},
         must=f"be {' or '.join(map(repr, formats))} over {name}",

@@ -43,7 +43,7 @@ def _text(pattern: str, must: str, *examples: str) -> Schema:
 
 
 def _size(units: Mapping[str, int], *examples: str) -> Schema:
-    such = " or ".join(f"'{each}'" for each in examples)
+    such = " or ".join(f"'{example}'" for example in examples)
     return _text(f"^{_NUMBER} ?(?:{'|'.join(units)})$", f"be a size with its unit, such as {such}", *examples)
 
 
