@@ -48,7 +48,7 @@ def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
         return
     for key, ours in OWN_KEYS.items():
         if not is_default(library, key):
-            span = config.places.get(tuple(key.split("/")), config.span)
+            span = config.spans.get(tuple(key.split("/")), config.span)
             where = f"'{key}' in '{config.path.name}'" if config.path else f"'{key}'"
             message = f"{where} is not allowed in the 'config' of a gateway"
             yield Diagnostic(span, Code.BAD_VALUE, message, f"set '{ours}' beside 'config' instead")
@@ -118,7 +118,7 @@ def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
         hint = "put the value in quotes"
     if config.path is not None:
         return Diagnostic(config.span, Code.BAD_FILE, f"Zenoh rejects '{config.path.name}': {why}", hint)
-    span = config.places.get(_blamed(json.loads(config.text), (), str(error)), config.span)
+    span = config.spans.get(_blamed(json.loads(config.text), (), str(error)), config.span)
     return Diagnostic(span, Code.BAD_VALUE, f"Zenoh rejects this: {why}", hint)
 
 

@@ -183,7 +183,7 @@ class FieldReader:
             members[name] = self._value(field.type, entry.value, kind)
 
     def _value(self, kind: Type, node: Node, holder: MessageType) -> FieldValue:
-        if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.place.is_whole_line:
+        if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.text_span.is_whole_line:
             return AnyValue(node.span)
         match kind, node:
             case MessageType(), ScalarNode() if kind.name in STAMP_TYPES:

@@ -47,7 +47,7 @@ from router.table.nodes import (
     Node,
     ScalarNode,
     SequenceNode,
-    TextPlace,
+    TextSpan,
     is_valid,
     marked_broken,
     to_data,
@@ -408,7 +408,7 @@ def _choices(node: MappingNode, span: SourceSpan) -> Expression:
         values,
         _expression(otherwise.value, otherwise.key.span) if otherwise else None,
     )
-    return Expression("", TextPlace(node.entries[MAP].key.span), choices=chosen)
+    return Expression("", TextSpan(node.entries[MAP].key.span), choices=chosen)
 
 
 def _expression(node: Node, span: SourceSpan) -> Expression:
@@ -418,9 +418,9 @@ def _expression(node: Node, span: SourceSpan) -> Expression:
     if isinstance(node, MappingNode):
         return replace(_expression(node.entries[TEXT].value, span), literal=True)
     if isinstance(node, SequenceNode):
-        return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
+        return Expression("", TextSpan(node.span), tuple(_expression(item, item.span) for item in node.items))
     written = scalar(node)
-    return Expression(written.text, written.place)
+    return Expression(written.text, written.text_span)
 
 
 def _fields(node: Node, span: SourceSpan) -> FieldMap:
@@ -451,7 +451,7 @@ def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:
     """Yield the spans of the names between the dots of a key; the whole key if its text is not verbatim."""
     start = 0
     for part in key.text.split("."):
-        yield key.place.part(start, start + len(part))
+        yield key.text_span.part(start, start + len(part))
         start += len(part) + 1
 
 
@@ -486,7 +486,7 @@ def _transport_address(transport: Transport, written: Located[str]) -> Located[A
 def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
     """Build a Zenoh configuration from a mapping of settings, or from the path of a file."""
     if isinstance(node, MappingNode):
-        return ZenohConfig(span, json.dumps(to_data(node)), places=dict(_places(node)))
+        return ZenohConfig(span, json.dumps(to_data(node)), spans=dict(_spans(node)))
     written = located(node)
     path = beside(written.value, written.span)
     try:
@@ -496,21 +496,21 @@ def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
         what = f"'{written.value}' cannot be read: {why}"
-        place = f"correct the path: it leads to {shown_path(path)}"
-        hint = place if isinstance(error, FileNotFoundError) else ""
+        remedy = f"correct the path: it leads to {shown_path(path)}"
+        hint = remedy if isinstance(error, FileNotFoundError) else ""
         raise InvalidValueError(written.span, Code.BAD_FILE, what, hint) from error
 
 
-def _places(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:
+def _spans(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:
     """Yield the span of each key and of each list item, by path."""
     if isinstance(node, MappingNode):
         for key, entry in node.entries.items():
             yield (*here, key), entry.key.span
-            yield from _places(entry.value, (*here, key))
+            yield from _spans(entry.value, (*here, key))
     elif isinstance(node, SequenceNode):
         for index, item in enumerate(node.items):
             yield (*here, index), item.span
-            yield from _places(item, (*here, index))
+            yield from _spans(item, (*here, index))
 
 
 def _pattern(node: Node, _: SourceSpan) -> TopicPattern:

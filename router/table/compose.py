@@ -24,7 +24,7 @@ from router.table.nodes import (
     Plain,
     ScalarNode,
     SequenceNode,
-    TextPlace,
+    TextSpan,
     cut_off,
     locate,
 )
@@ -147,16 +147,16 @@ class _Composer:
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)
-        place = self._place(event, span)
+        text_span = self._text_span(event, span)
         broken = self._has_tag(event, span)
         text = event.value
         if is_filled := has_variables(text):
             text, problems = fill(text, self._environ)
             for problem in problems:
-                part = place.part(problem.start, problem.end)
+                part = text_span.part(problem.start, problem.end)
                 self._findings.append(Diagnostic(part, problem.code, problem.message, problem.hint))
             broken |= bool(problems)
-            place = TextPlace(span)
+            text_span = TextSpan(span)
         if unusable := unusable_character(text):
             broken |= self._report(span, f"the text contains the character {unusable[1]}", "remove it")
         if not event.style and text[-1:] == "," and " " not in text and self._open_bracket() is None:
@@ -164,7 +164,7 @@ class _Composer:
                 span, f"'{text}' ends with a ','", "remove it: ',' separates values only inside brackets"
             )
         if event.style or broken:
-            return ScalarNode(span, text, text, place, broken, is_filled)
+            return ScalarNode(span, text, text, text_span, broken, is_filled)
         if odd := surprise(text):
             # Shows a variable by name, since its value may be secret.
             what = f"some YAML parsers read '{event.value}' as {odd.meaning}, others do not"
@@ -174,7 +174,7 @@ class _Composer:
                 hint = SAY_WHY.format(key)
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
-        return ScalarNode(span, text, resolve(text), place, broken, is_filled)
+        return ScalarNode(span, text, resolve(text), text_span, broken, is_filled)
 
     def _is_key(self) -> bool:
         """Return whether the next node is a key of a mapping."""
@@ -187,10 +187,10 @@ class _Composer:
         key = parent.children[-1] if parent and isinstance(parent.event, yaml.MappingStartEvent) else None
         return key.text if isinstance(key, ScalarNode) else ""
 
-    def _place(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextPlace:
+    def _text_span(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextSpan:
         line, first, end_line, last = _marks(event)
         if not event.style and event.value and event.value == self._source.lines[line][first:last]:
-            return TextPlace(span, ((0, span),))
+            return TextSpan(span, ((0, span),))
         if event.style in ("'", '"'):
             first, last = first + 1, last - 1
         elif event.style in ("|", ">"):
@@ -234,10 +234,10 @@ class _Composer:
 
     def _without_slip(self, key: Node) -> Node:
         """Return the key that is meant, and report a finding if it is misspelt."""
-        if isinstance(key, ScalarNode) and key.place.is_whole_line:
+        if isinstance(key, ScalarNode) and key.text_span.is_whole_line:
             for pattern, what, hint in _KEY_SLIPS:
                 if match := pattern.fullmatch(key.text):
-                    self._report(key.place.part(*match.span("slip")), what, hint)
+                    self._report(key.text_span.part(*match.span("slip")), what, hint)
                     return replace(key, text=match["key"], value=match["key"])
         return key
 

@@ -143,8 +143,8 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if finding.code is not Code.BAD_FILE or finding.span.end_column > finding.span.column:
             raise  # the file exists, but something in it is wrong
         what = f"'{reference.text}' cannot be extended: {finding.message.removeprefix(UNREADABLE)}"
-        place = f"correct the path: it leads to {shown_path(Path(inputs.real_path(path)))}"
-        hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or place
+        remedy = f"correct the path: it leads to {shown_path(Path(inputs.real_path(path)))}"
+        hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or remedy
         raise TableError.of(reference.span, Code.BAD_EXTENDS, what, hint) from error
 
 

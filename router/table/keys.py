@@ -18,7 +18,7 @@ from types import UnionType
 from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from router.errors import Located, SourceSpan
-from router.table.nodes import TextPlace
+from router.table.nodes import TextSpan
 from router.table.units import Quantity
 
 T = TypeVar("T")
@@ -163,7 +163,7 @@ def _flat(part: object, prefix: str) -> Iterator[tuple[str, str]]:
     for name, value, show in _settings(part):
         if isinstance(value, Mapping) or _has_keys(value):
             yield from _flat(value, f"{prefix}{name}.")
-        elif not isinstance(value, (SourceSpan, TextPlace)):
+        elif not isinstance(value, (SourceSpan, TextSpan)):
             yield prefix + name, show(value)
 
 
@@ -185,16 +185,16 @@ def _has_keys(value: object) -> bool:
 
 def are_same(one: object, other: object) -> bool:
     """Return whether two tables, or parts of them, have the same content, regardless of positions."""
-    return _without_places(one) == _without_places(other)
+    return _without_spans(one) == _without_spans(other)
 
 
-def _without_places(value: object) -> object:
+def _without_spans(value: object) -> object:
     if isinstance(value, SourceSpan):
         return None
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value), *(_without_places(getattr(value, field.name)) for field in fields(value))
+        return type(value), *(_without_spans(getattr(value, field.name)) for field in fields(value))
     if isinstance(value, Mapping):
-        return tuple((key, _without_places(member)) for key, member in value.items())
+        return tuple((key, _without_spans(member)) for key, member in value.items())
     if isinstance(value, (tuple, list)):
-        return tuple(map(_without_places, value))
+        return tuple(map(_without_spans, value))
     return value

@@ -13,7 +13,7 @@ from router.errors import SourceSpan
 
 
 @dataclass(frozen=True, slots=True)
-class TextPlace:
+class TextSpan:
     """The position of each character of a text.
 
     `stretches` are the parts of the text that a line of the file contains verbatim, each with its offset in the text.
@@ -36,8 +36,8 @@ class TextPlace:
         return [span for _, span in self.stretches] == [self.whole]
 
 
-def locate(text: str, whole: SourceSpan, pieces: Iterable[tuple[int, int, str]]) -> TextPlace:
-    """Return the place of a text that was written in `pieces`, one per line: line and column from 1, and the text.
+def locate(text: str, whole: SourceSpan, pieces: Iterable[tuple[int, int, str]]) -> TextSpan:
+    """Return the span of a text that was written in `pieces`, one per line: line and column from 1, and the text.
 
     Whitespace at the ends of a piece, and the text in place of a line end, is ignored.
     """
@@ -46,12 +46,12 @@ def locate(text: str, whole: SourceSpan, pieces: Iterable[tuple[int, int, str]])
     for line, column, piece in pieces:
         words = piece.strip()
         if not text.startswith(words, offset):
-            return TextPlace(whole)
+            return TextSpan(whole)
         if words:
             start = column + piece.index(words)
             stretches.append((offset, SourceSpan(whole.file, line, start, start + len(words))))
         offset = _after_blanks(text, offset + len(words))
-    return TextPlace(whole, tuple(stretches) if offset == len(text) else ())
+    return TextSpan(whole, tuple(stretches) if offset == len(text) else ())
 
 
 def _after_blanks(text: str, offset: int) -> int:
@@ -68,7 +68,7 @@ Plain = Union[None, bool, int, float, str]
 
 @dataclass(frozen=True, slots=True)
 class ScalarNode:
-    """A scalar: `text` as written, with variables replaced, `value` in YAML, and the `place` of the text.
+    """A scalar: `text` as written, with variables replaced, `value` in YAML, and the `text_span`.
 
     If the text `is_filled`, at least one variable was replaced.
     """
@@ -76,7 +76,7 @@ class ScalarNode:
     span: SourceSpan
     text: str
     value: Plain
-    place: TextPlace
+    text_span: TextSpan
     broken: bool = False
     is_filled: bool = False
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from router.errors import SourceSpan
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, TextPlace, is_valid
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, TextSpan, is_valid
 
 Entries = Mapping[str, Entry]
 NodeT = TypeVar("NodeT", bound=Node)
@@ -103,7 +103,7 @@ def _alone(key: str, node: ScalarNode) -> MappingNode:
 
 
 def _key(text: str, span: SourceSpan) -> ScalarNode:
-    return ScalarNode(span, text, text, TextPlace(span))
+    return ScalarNode(span, text, text, TextSpan(span))
 
 
 def _with(node: Node, defaults: Entries) -> Node:

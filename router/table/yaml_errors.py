@@ -435,7 +435,7 @@ def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagn
     lines = {source.file: source.lines for source in sources}
     for node in _expressions(root.get("routes"), is_expression=False):
         span = node.span
-        comment = lines[span.file][span.line - 1][span.end_column - 1 :] if node.place.is_whole_line else ""
+        comment = lines[span.file][span.line - 1][span.end_column - 1 :] if node.text_span.is_whole_line else ""
         if _REST.fullmatch(comment):
             what = f"the comment '{comment.strip()}' is not part of the expression before it"
             hint = "replace '#' with an operator, or add words to the comment"

@@ -320,7 +320,7 @@ def _configured(zenoh: ZenohSettings) -> list[str]:
         return []
     if zenoh.config.path is not None:
         return [f"configured by {shown_path(zenoh.config.path)}"]
-    return [f"configures {' and '.join(str(path[0]) for path in zenoh.config.places if len(path) == 1)}"]
+    return [f"configures {' and '.join(str(path[0]) for path in zenoh.config.spans if len(path) == 1)}"]
 
 
 def _period(period: int) -> str:

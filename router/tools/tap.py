@@ -25,7 +25,7 @@ from router.library import library
 from router.observe.tap import Lost
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.model.expressions import Expression
-from router.table.nodes import TextPlace
+from router.table.nodes import TextSpan
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase
@@ -76,8 +76,7 @@ class Condition:
 def _checked(text: str, message: MessageType) -> Node:
     """Parse a condition on a message. Raises ExpressionError if it is not a valid one."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
-    place = TextPlace(span, ((0, span),))
-    node = check(Expression(text, place), Scope(message, tuple(_enums(message)), ()))
+    node = check(Expression(text, TextSpan(span, ((0, span),))), Scope(message, tuple(_enums(message)), ()))
     if not isinstance(node.kind, BoolKind):
         raise ExpressionError(
             span, Code.TYPE_MISMATCH, f"it is {node.kind}, not a bool", "compare something, as in speed > 0"

@@ -26,7 +26,7 @@ from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
-from router.table.nodes import TextPlace
+from router.table.nodes import TextSpan
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.machine import FAILURES, machine
 from tests.oracles.reference import fill
@@ -41,14 +41,14 @@ SOURCE = "sensor_board"
 def written(text: str) -> Expression:
     """An expression at line 7, column 3 of a table."""
     span = SourceSpan("table.yaml", 7, 3, 3 + len(text))
-    return Expression(text, TextPlace(span, ((0, span),)))
+    return Expression(text, TextSpan(span, ((0, span),)))
 
 
 def chosen(subject: str, values: Mapping[str, str], otherwise: str | None = None) -> Expression:
     """The expression `{map: subject, **values, else: otherwise}`."""
     listed = tuple((Located(name, SPAN), written(text)) for name, text in values.items())
     choices = Choices(written(subject), listed, None if otherwise is None else written(otherwise))
-    return Expression("", TextPlace(SPAN), choices=choices)
+    return Expression("", TextSpan(SPAN), choices=choices)
 
 
 def field_map(auto: bool = False, /, **entries: str | Expression) -> FieldMap:

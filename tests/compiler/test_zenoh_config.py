@@ -19,7 +19,7 @@ HERE = SourceSpan("routes/rover.yaml", 5)
 
 def mapping(value: Any) -> ZenohConfig:
     """Its places have for columns the length of their paths."""
-    return ZenohConfig(HERE, json.dumps(value), places={path: SourceSpan("t", 9, len(path)) for path in _paths(value)})
+    return ZenohConfig(HERE, json.dumps(value), spans={path: SourceSpan("t", 9, len(path)) for path in _paths(value)})
 
 
 def _paths(value: Any, here: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:

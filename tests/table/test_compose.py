@@ -63,7 +63,7 @@ def test_an_expression_knows_where_its_text_stands(
     found = scalar(tmp_path, text)
     assert found.value == value
     assert (found.span.line, found.span.column, found.span.end_column) == (1, *columns)
-    assert [(offset, span.line, span.column) for offset, span in found.place.stretches] == stretches
+    assert [(offset, span.line, span.column) for offset, span in found.text_span.stretches] == stretches
 
 
 def test_what_a_variable_holds_is_resolved_again(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_mapping_for_zenoh_has_the_places_of_its_keys_and_items(tmp_path: Path
     assert json.loads(config.text) == {"qos": {"publication": [{"key_exprs": ["b"]}]}, "id": "12"}
     assert config.path is None
     written = f"  it: {{{settings}}}"
-    columns = {path: place.column for path, place in config.places.items()}
+    columns = {path: place.column for path, place in config.spans.items()}
     assert columns == {
         ("qos",): written.index("qos") + 1,
         ("qos", "publication"): written.index("publication") + 1,

@@ -32,7 +32,7 @@ from router.compiler.expressions.syntax import Parsed, forbidden
 from router.compiler.expressions.tree import Call, Constant, Node, Operator, constant_of
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.table.model.expressions import Choices, Expression
-from router.table.nodes import TextPlace
+from router.table.nodes import TextSpan
 from router.types.model import List, Type
 
 DEEPEST = 60
@@ -99,7 +99,7 @@ def _key(name: Located[str], subject: Node, choices: Choices, scope: Scope) -> N
         return key
     if name.value in scope.message.constants:
         return constant(scope.message.constants[name.value], name.span)
-    checked = check(Expression(name.value, TextPlace(name.span)), scope)
+    checked = check(Expression(name.value, TextSpan(name.span)), scope)
     if constant_of(checked) is None:
         message = f"'{name.value}' is not a constant"
         raise ExpressionError(name.span, Code.TYPE_MISMATCH, message, "the keys of a map are values, not fields")

@@ -64,9 +64,9 @@ _WITHOUT_VALUE = re.compile(
 
 
 class Slip(NamedTuple):
-    """A mistake that makes an expression invalid: its place (start, end), message and hint."""
+    """A mistake that makes an expression invalid: its span (start, end), message and hint."""
 
-    place: tuple[int, int]
+    span: tuple[int, int]
     what: str
     hint: str
 

@@ -36,7 +36,7 @@ class Parsed:
 
     def _parse(self, text: str) -> ast.expr:
         if "#" in text and (at := _comment(text)) is not None:
-            span = self._expression.place.part(self._indent + at, self._indent + at + 1)
+            span = self._expression.text_span.part(self._indent + at, self._indent + at + 1)
             message = "'#' ends the expression, and the rest is ignored"
             hint = "remove it: in quoted and in multi-line text, '#' does not start a YAML comment"
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint)
@@ -49,7 +49,7 @@ class Parsed:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
             hint = self._of_word(text) or foreign_syntax.of_syntax(self._expression.text)
             if slip := foreign_syntax.slip(text, self._names):
-                span, reason = self._expression.place.part(*(self._indent + at for at in slip.place)), slip.what
+                span, reason = self._expression.text_span.part(*(self._indent + at for at in slip.span)), slip.what
                 hint = slip.hint
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
@@ -67,17 +67,17 @@ class Parsed:
         """Return the span of a syntax error, which counts from 1 and may have no position, or end on another line."""
         start = max(error.offset or 1, 1) - 1
         end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
-        return self._expression.place.part(self._indent + start, self._indent + end)
+        return self._expression.text_span.part(self._indent + start, self._indent + end)
 
     def span(self, node: ast.expr) -> SourceSpan:
         """Return the span of a node in the table."""
         end = node.end_col_offset if node.end_col_offset is not None else node.col_offset + 1
-        return self._expression.place.part(self._characters(node.col_offset), self._characters(end))
+        return self._expression.text_span.part(self._characters(node.col_offset), self._characters(end))
 
     def last_span(self, node: ast.Attribute) -> SourceSpan:
         """Return the span of the last name of `a.b.c`."""
         end = self._characters(node.end_col_offset or 0)
-        return self._expression.place.part(end - len(node.attr), end)
+        return self._expression.text_span.part(end - len(node.attr), end)
 
     def outermost(self, node: ast.Attribute) -> ast.Attribute:
         """Return the whole `a.b.c.d` that contains `a.b`."""

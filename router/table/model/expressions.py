@@ -3,26 +3,26 @@
 from dataclasses import dataclass
 
 from router.errors import Located, SourceSpan
-from router.table.nodes import TextPlace
+from router.table.nodes import TextSpan
 
 
 @dataclass(frozen=True, slots=True)
 class Expression:
     """The text of an expression, not yet parsed.
 
-    `place` has the position of each character. A YAML sequence becomes `items`, a mapping with the key `map` becomes
-    `choices`; both have empty text. `literal` text, `{text: imu_link}`, is not an expression.
+    `text_span` has the position of each character. A YAML sequence becomes `items`, a mapping with the key `map`
+    becomes `choices`; both have empty text. `literal` text, `{text: imu_link}`, is not an expression.
     """
 
     text: str
-    place: TextPlace
+    text_span: TextSpan
     items: "tuple[Expression, ...] | None" = None
     choices: "Choices | None" = None
     literal: bool = False
 
     @property
     def span(self) -> SourceSpan:
-        return self.place.whole
+        return self.text_span.whole
 
     def __str__(self) -> str:
         if self.choices is not None:

@@ -71,14 +71,14 @@ class TopicRate:
 class ZenohConfig:
     """Configuration of the Zenoh library: the file at `path`, or a mapping in the table (`path` None).
 
-    `text` is the content of the file, or the mapping as JSON. It may contain passwords: never print it. `places` are
-    the spans of the mapping's keys and list items, by path.
+    `text` is the content of the file, or the mapping as JSON. It may contain passwords: never print it. `spans` are
+    those of the mapping's keys and list items, by path.
     """
 
     span: SourceSpan
     text: str = field(repr=False)
     path: Path | None = None
-    places: Mapping[tuple[str | int, ...], SourceSpan] = field(default_factory=dict, repr=False)
+    spans: Mapping[tuple[str | int, ...], SourceSpan] = field(default_factory=dict, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
