@@ -326,7 +326,7 @@ class Plane:
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" if an earlier program refused the message."""
         program = self._programs.get(generation)
-        return where_refused(program.lowered, route, topic, target, place) if program is not None else ""
+        return where_refused(program, route, topic, target, place) if program is not None else ""
 
 
 def _stop(threads: Sequence[PublishThread | FromRosThread | ClientDeadmen]) -> bool:

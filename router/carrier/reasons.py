@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from router import datagrams
-from router.compiler.lowering import Lowered, LoweredFeed, LoweredRoute
 from router.compiler.program import Program
 from router.declared import DropReason, Reason
 from router.table.model.endpoints import Framing
@@ -35,10 +34,8 @@ def superseded(program: Program, listener: str, data: bytes) -> str:
     return ", then ".join(datagrams.payloads(program.envelope, data, repairs=plan.framing is Framing.ZERO_TRIMMED))
 
 
-def where_refused(lowered: Lowered, route: str, topic: str | None, target: str, place: int) -> str:
+def where_refused(program: Program, route: str, topic: str | None, target: str, place: int) -> str:
     """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
-    if topic is not None:
-        serving: list[LoweredRoute | LoweredFeed] = [feed for feed in lowered.from_ros[topic] if feed.route == route]
-    else:
-        serving = [by_route[route] for by_route in (lowered.to_topics, lowered.to_destinations) if route in by_route]
-    return next(each.targets[target] for each in serving if target in each.targets).places[place]
+    (plan,) = (plan for plan in program.routes if (plan.route, plan.topic) == (route, topic))
+    by_label = {to.label: to for to in plan.targets if to.places}  # a topic rather than an endpoint of the same name
+    return by_label[target].places[place]

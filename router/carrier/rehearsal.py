@@ -160,7 +160,7 @@ class Stage:
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" for messages held since an earlier program."""
         is_current = generation == self._generation
-        return where_refused(self._in_use.program.lowered, route, topic, target, place) if is_current else ""
+        return where_refused(self._in_use.program, route, topic, target, place) if is_current else ""
 
 
 class _Opened:
