@@ -9,12 +9,12 @@ from typing import Any
 
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Encoding
-from router.gateway.kept import MOST_KEPT_BYTES
+from router.gateway.latched import MOST_LATCHED_BYTES
 from router.gateway.transport.base import HIGH_WATER, Client, Frame, Transport
 from router.log import FloodLog, logger
 
 MOST_BACKLOG = 256 << 20
-"""Bytes that wait for all clients of a gateway at which no more kept messages are sent."""
+"""Bytes that wait for all clients of a gateway at which no more latched messages are sent."""
 
 
 class ClientQueue:
@@ -33,7 +33,7 @@ class ClientQueue:
         self.missed_topics: set[str] = set()
         """Topics with a queued frame that a newer one replaced."""
         self.shown: dict[str, set[int]] = {}
-        """Times of publication (ns) of the kept messages that the client has, of topics that it has in part."""
+        """Times of publication (ns) of the latched messages that the client has, of topics that it has in part."""
         self.has_left = False
         self._on_wire = on_wire
         self._drained: asyncio.Future[None] | None = None
@@ -51,20 +51,20 @@ class ClientQueue:
 
     @property
     def held(self) -> int:
-        """Frames that wait for the kept messages of their topic."""
+        """Frames that wait for the latched messages of their topic."""
         return sum(map(len, self._held.values()))
 
     @property
     def holds(self) -> bool:
-        """Whether the kept messages of any topic are on their way."""
+        """Whether the latched messages of any topic are on their way."""
         return bool(self._held)
 
     def is_held(self, topic: str) -> bool:
-        """Whether the kept messages of this topic are on their way."""
+        """Whether the latched messages of this topic are on their way."""
         return topic in self._held
 
     def record_miss(self, topic: str) -> None:
-        """Record that the client missed a message of the topic, unless kept messages on their way include it."""
+        """Record that the client missed a message of the topic, unless latched messages on their way include it."""
         (self._held_incomplete if topic in self._held else self.missed_topics).add(topic)
 
     @property
@@ -81,7 +81,7 @@ class ClientQueue:
         self.sent += len(frames)
 
     def hold(self, topic: str) -> bool:
-        """Hold values of the topic until `release`, because its kept messages come first.
+        """Hold values of the topic until `release`, because its latched messages come first.
 
         Return False if they are held already.
         """
@@ -118,7 +118,7 @@ class ClientQueue:
             self._drained = None
 
     def release(self, topic: str, *, is_complete: bool = False) -> list[Frame]:
-        """Return the held values of the topic, in order. `is_complete`: the kept messages include all others so far."""
+        """Return the held values of the topic, in order. `is_complete`: the latched messages include all so far."""
         if topic in self._held_incomplete:
             self._held_incomplete.discard(topic)
             if not is_complete:
@@ -140,7 +140,7 @@ class ClientQueue:
                 continue
             self._held[frame.topic].append(frame)
             self._held_bytes += len(frame.data)
-        if self._held_bytes > MOST_KEPT_BYTES:
+        if self._held_bytes > MOST_LATCHED_BYTES:
             for topic in list(self._held):
                 passed += self.release(topic)
         return passed
@@ -229,7 +229,7 @@ class Clients:
             ready[0].write(frames)
 
     def has_room(self, size: int) -> bool:
-        """Return whether the backlogs of all clients leave room for a kept message of this size."""
+        """Return whether the backlogs of all clients leave room for a latched message of this size."""
         backlog = sum(queue.backlog() for queue in self.queues)
         return backlog == 0 or backlog + size <= MOST_BACKLOG
 

@@ -26,7 +26,7 @@ class Selection(NamedTuple):
 
     @property
     def is_mixed(self) -> bool:
-        """Whether only some publishers keep messages. A subscription to all publishers then gets no kept messages."""
+        """Whether only some publishers keep messages. A subscription to all publishers then gets no latched ones."""
         return bool(self.keepers) and not self.keeps
 
 

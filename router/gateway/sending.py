@@ -13,7 +13,7 @@ from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import LARGE, Encoding, Sample
 from router.gateway.json_codec import UnreadableError
-from router.gateway.kept import MOST_KEPT, Kept
+from router.gateway.latched import MOST_LATCHED, Fetched
 from router.gateway.publishers import Selection
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import PER_TURN, Frame
@@ -33,7 +33,7 @@ class ServedTopic:
     `period` is in ns, or EACH for every message; `number` selects the topic's turn within it. `counted` is how many
     messages of `subscription.arrived` are already in the counters (of `subscription.missed` if every message is sent),
     `reported` how many are in the rates for clients. `sample` is the latest message taken, `readable` the latest that
-    could be converted. `is_busy` is set while a large message is being converted; `unconverted` ones wait. Kept
+    could be converted. `is_busy` is set while a large message is being converted; `unconverted` ones wait. Latched
     messages that were published up to `refused_ns` and cannot be sent have already been counted. `counted_early` has
     the times of publication (ns) of those that were counted for a late client, and may still arrive on the topic.
     """
@@ -49,7 +49,7 @@ class ServedTopic:
     is_busy: bool = False
     has_ended: bool = False
     refused_ns: int = 0
-    counted_early: deque[int] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
+    counted_early: deque[int] = field(default_factory=lambda: deque(maxlen=MOST_LATCHED))
     seen: int = -1
     looks: int = 0
     unconverted: deque[Sample] = field(default_factory=deque)
@@ -252,29 +252,29 @@ class TopicSender:
         )
         return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
 
-    async def kept(self, served: ServedTopic, kept: Kept) -> AsyncGenerator[Frame, None]:
-        """Yield the messages kept for late joiners, oldest first; then the latest value if others may have sent it."""
+    async def latched(self, served: ServedTopic, fetched: Fetched) -> AsyncGenerator[Frame, None]:
+        """Yield the latched messages, oldest first; then the latest value if others may have sent it."""
         topic = served.subscription
-        samples = kept.samples
+        samples = fetched.samples
         if served.selection.is_mixed and (latest := topic.latest()):
             earlier = [sample for sample in samples if (sample.sent_ns, sample.cdr) != (latest.sent_ns, latest.cdr)]
             samples = [*earlier, latest]
         for number, sample in enumerate(samples, 1):
             if number % PER_TURN == 0:
                 await asyncio.sleep(0)
-            if (frame := await self._kept_frame(served, kept, sample)) is not None:
+            if (frame := await self._latched_frame(served, fetched, sample)) is not None:
                 yield frame._replace(older=len(samples) - number)
 
-    async def _kept_frame(self, served: ServedTopic, kept: Kept, sample: Sample) -> Frame | None:
-        """Return the frame of a kept message, shared by all clients; None if it cannot be sent, which is counted."""
+    async def _latched_frame(self, served: ServedTopic, fetched: Fetched, sample: Sample) -> Frame | None:
+        """Return the frame of a latched message, shared by all clients; None if it cannot be sent, which is counted."""
         key = self, sample
-        if (frame := kept.frame(key)) is not None:
+        if (frame := fetched.frame(key)) is not None:
             return frame
         if not self._is_quick(sample):
             await self._prepare(sample)
         is_new = sample.sent_ns > served.refused_ns
         if frame := self._checked(served, sample, is_new=False):
-            kept.remember(key, frame)
+            fetched.remember(key, frame)
         elif is_new:
             self._counters.received(1)
             self._checked(served, sample, is_new=True)

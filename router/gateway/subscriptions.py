@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from router.compiler.lookup import definitions_of
 from router.errors import StartError, TableError
 from router.gateway.encoding import ReadyType, Sample
-from router.gateway.kept import FetchBudget, KeptMessages
+from router.gateway.latched import FetchBudget, LatchedMessages
 from router.gateway.publishers import Selection, select
 from router.gateway.transport.base import PER_TURN
 from router.threads import DaemonThread
@@ -83,7 +83,7 @@ class TopicSubscription:
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
-        self.kept = KeptMessages(
+        self.latched = LatchedMessages(
             topic, ready, topics, loop, lambda: self.arrived, lambda: self.latest() if self._keeps else None, budget
         )
         """The messages that publishers keep for late joiners."""
@@ -145,7 +145,7 @@ class TopicSubscription:
 
     def close(self) -> None:
         """Unsubscribe; `latest` and `arrived` keep their values."""
-        self.kept.close()
+        self.latched.close()
         self._unsubscribe()
 
     def _unsubscribe(self) -> None:

@@ -17,7 +17,7 @@ from router.gateway.clients import ClientQueue, Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Sample
-from router.gateway.kept import Kept
+from router.gateway.latched import Fetched
 from router.gateway.publishers import Selection
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import NotInstalledError, TopicSubscription
@@ -37,7 +37,7 @@ RESEND_S = 0.5
 """The interval of checks for clients that lack messages which publishers still keep."""
 
 DRAIN_S, SHOW_S = 1.0, 10.0
-"""How long kept messages of a topic wait for a client that takes nothing, and for one that takes them slowly."""
+"""How long latched messages of a topic wait for a client that takes nothing, and for one that takes them slowly."""
 
 SHORTEST_TURN = 10_000_000
 """The minimum time between turns, ns: shorter ones cost more than they gain."""
@@ -183,7 +183,7 @@ class Topics:
         if before and before.subscription is subscription:
             self._subscriptions.leave(subscription, callback)  # it was already joined
             if selection.is_mixed and selection.keepers - before.selection.keepers:
-                self._clients.record_miss(topic)  # this subscription does not get their kept messages
+                self._clients.record_miss(topic)  # this subscription does not get their latched messages
             if before.selection.keepers - selection.keepers:
                 before.readable = None  # its publisher may be gone
             before.selection = selection
@@ -249,12 +249,12 @@ class Topics:
         self._clients.send([self._sender.schema(served) for served in is_known])
         if self._is_udp:  # a new client goes unnoticed
             for queue in self._clients.queues.values():
-                self._show_kept(queue, is_known, may_hold=False)
+                self._show_latched(queue, is_known, may_hold=False)
 
-    # -- messages kept for late joiners ------------------------------------------------------------------------
+    # -- latched messages ----------------------------------------------------------------------------------------------
 
-    def _show_kept(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, may_hold: bool = True) -> None:
-        """Send a client the kept messages of these topics, a little later.
+    def _show_latched(self, queue: ClientQueue, topics: Iterable[ServedTopic], *, may_hold: bool = True) -> None:
+        """Send a client the latched messages of these topics, a little later.
 
         Newer messages are held until then, if they may be and all publishers of their topic keep messages.
         """
@@ -266,7 +266,7 @@ class Topics:
 
     async def _show(self, queue: ClientQueue, topic: str, *, holds: bool) -> None:
         queue.missed_topics.discard(topic)
-        is_whole, is_complete = await self._write_kept(queue, topic)
+        is_whole, is_complete = await self._write_latched(queue, topic)
         known = queue.shown.get(topic, set()) if not is_whole else queue.shown.pop(topic, set())
         held = queue.release(topic, is_complete=is_complete) if holds else []
         if queue.has_left:
@@ -276,17 +276,17 @@ class Topics:
         missing = [frame for frame in held if frame.sent_ns not in known]
         self._clients.send_to(queue, sorted(missing, key=lambda frame: frame.sent_ns))
 
-    async def _write_kept(self, queue: ClientQueue, topic: str) -> tuple[bool, bool]:
-        """Write the kept messages of a topic as the client drains, without those that it has.
+    async def _write_latched(self, queue: ClientQueue, topic: str) -> tuple[bool, bool]:
+        """Write the latched messages of a topic as the client drains, without those that it has.
 
         Return whether it has all of them, and whether no other message has arrived since.
         """
         is_whole = is_complete = True
         while (served := self._served.get(topic)) is not None and served.selection.keepers and not queue.has_left:
             try:
-                async with served.subscription.kept.fetched() as kept:
-                    is_whole = await self._write_fetched(queue, served, kept)
-                    is_complete = kept.arrived == served.subscription.arrived
+                async with served.subscription.latched.fetched() as fetched:
+                    is_whole = await self._write_fetched(queue, served, fetched)
+                    is_complete = fetched.arrived == served.subscription.arrived
             except Exception as error:  # noqa: BLE001 reported; other messages are still sent
                 self._failed(error)
                 break
@@ -294,7 +294,7 @@ class Topics:
                 return is_whole, is_complete
         return True, False
 
-    async def _write_fetched(self, queue: ClientQueue, served: ServedTopic, kept: Kept) -> bool:
+    async def _write_fetched(self, queue: ClientQueue, served: ServedTopic, fetched: Fetched) -> bool:
         """Write fetched messages as the client drains. Return False if it takes nothing for DRAIN_S, or too long.
 
         Then it gets the others later, from publishers that still keep them.
@@ -303,12 +303,12 @@ class Topics:
         known = queue.shown.setdefault(topic, set())
         skipped = {
             *known,
-            *(sample.sent_ns for sample in kept.samples),
+            *(sample.sent_ns for sample in fetched.samples),
         }  # held ones that come, or came, from publishers
         begun_with = frozenset(known)
         until = asyncio.get_running_loop().time() + SHOW_S
         waiting: list[Frame] = []
-        async with aclosing(self._sender.kept(served, kept)) as frames:
+        async with aclosing(self._sender.latched(served, fetched)) as frames:
             async for frame in frames:
                 if queue.has_left:
                     return False
@@ -345,7 +345,7 @@ class Topics:
         self._clients.send([schema])
         self._sender.introduced([schema])
         for queue in self._clients.queues.values():
-            self._show_kept(queue, [served])
+            self._show_latched(queue, [served])
 
     async def _resend_missed(self) -> None:
         """Send clients the messages of a topic that they lack, once it is quiet and they keep up."""
@@ -357,14 +357,14 @@ class Topics:
             for queue in behind:
                 if topic in queue.missed_topics and not queue.is_held(topic):
                     queue.missed_topics.discard(topic)
-                    self._show_kept(queue, [served] if served else [])
+                    self._show_latched(queue, [served] if served else [])
 
     # -- answers -----------------------------------------------------------------------------------------------
 
     def snapshot(self, queue: ClientQueue, type_name: str | None = None, *, is_for_all: bool = False) -> list[Frame]:
         """Return schemas and latest values of all topics, or of those of one type. `is_for_all`: all clients get them.
 
-        A little later, kept messages are sent to the client, and large values that are not converted yet to all.
+        A little later, latched messages are sent to the client, and large values that are not converted yet to all.
         """
         frames: list[Frame] = []
         topics = [served for served in self._served.values() if type_name in (None, served.subscription.type_name)]
@@ -372,21 +372,21 @@ class Topics:
             self._sender.show(served, frames)
         if is_for_all:
             self._sender.introduced(frames)
-        self._show_kept(queue, topics, may_hold=not self._is_shared)
+        self._show_latched(queue, topics, may_hold=not self._is_shared)
         return frames
 
     async def everything(self) -> list[Frame]:
-        """Return all schemas, latest values and kept messages."""
+        """Return all schemas, latest values and latched messages."""
         frames: list[Frame] = []
         topics = list(self._served.values())
         for served in topics:
             self._sender.show(served, frames)
-        kept = [self._all_kept(served) for served in topics if served.selection.keepers]
-        return [*frames, *chain.from_iterable(await asyncio.gather(*kept))]
+        latched = [self._all_latched(served) for served in topics if served.selection.keepers]
+        return [*frames, *chain.from_iterable(await asyncio.gather(*latched))]
 
-    async def _all_kept(self, served: ServedTopic) -> list[Frame]:
-        async with served.subscription.kept.fetched() as kept:
-            return [frame async for frame in self._sender.kept(served, kept)]
+    async def _all_latched(self, served: ServedTopic) -> list[Frame]:
+        async with served.subscription.latched.fetched() as fetched:
+            return [frame async for frame in self._sender.latched(served, fetched)]
 
     def rates(self, seconds: float) -> Iterator[tuple[str, str, float]]:
         """Yield every topic with its type and its rate over the `seconds` since the last call."""

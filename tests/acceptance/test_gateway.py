@@ -18,7 +18,7 @@ import pytest
 import zenoh
 from backports import zstd
 
-from router.gateway.kept import FRESH_S
+from router.gateway.latched import FRESH_S
 from router.gateway.packets import unbatched
 from tests.acceptance.gateway_clients import (
     Dashboard,

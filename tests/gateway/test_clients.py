@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.clients import ClientQueue
-from router.gateway.kept import MOST_KEPT_BYTES
+from router.gateway.latched import MOST_LATCHED_BYTES
 from router.gateway.transport.base import HIGH_WATER, Frame
 
 MS = 1_000_000
@@ -139,7 +139,7 @@ def test_values_that_wait_are_bounded() -> None:
     one = new_queue(Client())
     one.hold("/map")
     one.hold("/imu")
-    large = data("/map", bytes(MOST_KEPT_BYTES // 2))
+    large = data("/map", bytes(MOST_LATCHED_BYTES // 2))
     small = data("/imu", b"1")
     assert one.hold_back([large, small]) == []
     assert one.hold_back([large]) == [large, large, small]

@@ -22,8 +22,8 @@ PER_TURN = 32
 class Frame(NamedTuple):
     """One packet or document to send. `data` does not include the framing of the transport.
 
-    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers kept messages of a
-    topic backwards from the newest one, which has 0. `sent_ns` is the source timestamp of a message (wall clock).
+    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`. `older` numbers latched messages of
+    a topic backwards from the newest one, which has 0. `sent_ns` is the source timestamp of a message (wall clock).
     """
 
     data: bytes
@@ -76,7 +76,7 @@ class Events(Protocol):
         """The number of connected routers and peers of the network has changed."""
 
     async def snapshot(self) -> Sequence[Frame]:
-        """Return all schemas, latest values and messages kept for late joiners. A schema precedes its data."""
+        """Return all schemas, latest values and latched messages. A schema precedes its data."""
 
 
 def report_fault(where: str, error: Exception) -> None:

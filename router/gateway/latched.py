@@ -1,4 +1,4 @@
-"""The messages that publishers of a topic keep for late joiners (`transient_local`)."""
+"""Latched messages: those that publishers of a topic keep for late joiners (`transient_local`)."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from router.log import logger
 if TYPE_CHECKING:  # which imports rclpy
     from router.ros.topics import RosTopics, TopicTap
 
-MOST_KEPT = 1000
-MOST_KEPT_BYTES = 64 << 20
+MOST_LATCHED = 1000
+MOST_LATCHED_BYTES = 64 << 20
 """Maximum messages of one topic, and their bytes, that late joiners get: the newest ones."""
 
 FIRST_BYTES = 8 << 20
 """Bytes that are reserved for the messages of a topic during a fetch, unless they are large or turn out to be more."""
 
-MOST_FETCHED_BYTES = 2 * MOST_KEPT_BYTES
+MOST_FETCHED_BYTES = 2 * MOST_LATCHED_BYTES
 """Maximum bytes of fetched messages of all topics, and of the frames made from them."""
 
 POLL_S = 0.02
 QUIET_S = 0.1
-"""Publishers have delivered everything when nothing that they kept has arrived for this long."""
+"""Publishers have delivered everything when no latched message has arrived for this long."""
 
 PATIENCE_S = 2.0
 """How long to wait for publishers that deliver nothing: they may have published nothing yet."""
@@ -39,13 +39,13 @@ REPAIR_S = 4.0
 """How long to wait in both cases if messages are large: Fast DDS sends a lost fragment again after 3 s."""
 
 LIMIT_S = 20.0
-"""The longest fetch: new messages of a publisher whose clock is behind look like kept ones."""
+"""The longest fetch: new messages of a publisher whose clock is behind look like latched ones."""
 
 FRESH_S = 1.0
 """How long fetched messages are reused if none arrives, so that many clients cost few subscriptions."""
 
 
-class Kept:
+class Fetched:
     """Fetched messages, and how many had `arrived` on the topic when the last one was taken.
 
     `frames` has the latest of their frames, by gateway and message, which the clients of a gateway share. `users` is
@@ -82,7 +82,7 @@ class FetchBudget:
     def __init__(self) -> None:
         self.reserved = 0
         self.large = asyncio.Lock()
-        self._owners: list[KeptMessages] = []
+        self._owners: list[LatchedMessages] = []
         self._waiting: deque[asyncio.Future[None]] = deque()
 
     async def reserve(self, size: int) -> None:
@@ -106,10 +106,10 @@ class FetchBudget:
             if not (room := self._waiting.popleft()).done():
                 room.set_result(None)
 
-    def add(self, owner: KeptMessages) -> None:
+    def add(self, owner: LatchedMessages) -> None:
         self._owners.append(owner)
 
-    def remove(self, owner: KeptMessages) -> None:
+    def remove(self, owner: LatchedMessages) -> None:
         self._owners.remove(owner)
 
 
@@ -117,7 +117,7 @@ class _TooMuchError(Exception):
     """The messages exceed what is reserved for them."""
 
 
-class KeptMessages:
+class LatchedMessages:
     """Fetches the messages from the publishers with a short-lived subscription.
 
     They are not cached here: only a publisher knows how many messages it keeps, and they vanish with it. `arrived`
@@ -143,31 +143,31 @@ class KeptMessages:
         self._latest = latest
         self._budget = budget
         self._is_large = False
-        self._asking: asyncio.Task[Kept] | None = None
+        self._asking: asyncio.Task[Fetched] | None = None
         self._waiting = 0
-        self._found: Kept | None = None
+        self._found: Fetched | None = None
         self._found_from: frozenset[bytes] = frozenset()
         self._is_old = False
         self._aging: asyncio.TimerHandle | None = None
 
     @asynccontextmanager
-    async def fetched(self) -> AsyncIterator[Kept]:
+    async def fetched(self) -> AsyncIterator[Fetched]:
         """Give the messages in the order of publication. Concurrent calls share one subscription.
 
         The result is empty if the subscription fails, which is logged, or is closed meanwhile.
         """
         self._waiting += 1
         try:
-            kept = await self._get()
-            kept.users += 1
+            fetched = await self._get()
+            fetched.users += 1
         finally:
             self._waiting -= 1
         try:
-            yield kept
+            yield fetched
         finally:
-            kept.users -= 1
-            if kept is not self._found:
-                self._free(kept)
+            fetched.users -= 1
+            if fetched is not self._found:
+                self._free(fetched)
             else:
                 self._forget_if_old()
                 self._budget.recheck()  # it may be idle now
@@ -177,7 +177,7 @@ class KeptMessages:
         """Whether there are fetched messages, and nobody is being sent them."""
         return self._found is not None and not self._found.users and not self._waiting
 
-    async def _get(self) -> Kept:
+    async def _get(self) -> Fetched:
         if (asking := self._asking) is None:
             publishers = keepers(self._topics.publishers(self._topic), self._ready.message.name)
             found = self._found
@@ -185,7 +185,7 @@ class KeptMessages:
                 return found
             asking = self._asking = self._loop.create_task(self._ask(publishers))
         await asyncio.wait([asking])  # it continues for others if this call is cancelled
-        return Kept() if asking.cancelled() else asking.result()
+        return Fetched() if asking.cancelled() else asking.result()
 
     def close(self) -> None:
         """Unsubscribe, and forget the messages."""
@@ -212,12 +212,12 @@ class KeptMessages:
         self._is_old = True
         self._forget_if_old()
 
-    def _free(self, kept: Kept) -> None:
-        if not kept.users:
-            size, kept.reserved = kept.reserved, 0
+    def _free(self, fetched: Fetched) -> None:
+        if not fetched.users:
+            size, fetched.reserved = fetched.reserved, 0
             self._budget.release(size)
 
-    async def _ask(self, publishers: frozenset[bytes]) -> Kept:
+    async def _ask(self, publishers: frozenset[bytes]) -> Fetched:
         self.forget()
         newest = self._latest()
         self._is_large |= newest is not None and len(newest.cdr) > LARGE
@@ -227,7 +227,7 @@ class KeptMessages:
             logger.warning(
                 "cannot fetch the messages that publishers keep for late joiners", topic=self._topic, error=str(error)
             )
-            found = Kept()
+            found = Fetched()
         if found.reserved:
             self._found, self._found_from = found, publishers
             self._budget.add(self)
@@ -236,7 +236,7 @@ class KeptMessages:
         self._asking = None
         return found
 
-    async def _fetch_all(self, publishers: int) -> Kept:
+    async def _fetch_all(self, publishers: int) -> Fetched:
         """Fetch the messages. Raises StartError."""
         if not self._is_large:
             try:
@@ -244,27 +244,27 @@ class KeptMessages:
             except _TooMuchError:
                 self._is_large = True
         async with self._budget.large:
-            return await self._fetch(publishers, MOST_KEPT_BYTES)
+            return await self._fetch(publishers, MOST_LATCHED_BYTES)
 
-    async def _fetch(self, publishers: int, reserved: int) -> Kept:
+    async def _fetch(self, publishers: int, reserved: int) -> Fetched:
         """Fetch the messages within `reserved` bytes. Raises _TooMuchError, StartError."""
         await self._budget.reserve(reserved)
-        kept: Kept | None = None
+        fetched: Fetched | None = None
         try:
             tap = self._topics.tap(
-                self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_KEPT
+                self._topic, self._ready.message_class, is_reliable=True, keeps=True, depth=MOST_LATCHED
             )
             try:
-                kept = await self._collect(tap, publishers, reserved)
+                fetched = await self._collect(tap, publishers, reserved)
             finally:
                 tap.close()
-            self._budget.release(reserved - kept.reserved)
-            return kept
+            self._budget.release(reserved - fetched.reserved)
+            return fetched
         finally:
-            if kept is None:
+            if fetched is None:
                 self._budget.release(reserved)
 
-    async def _collect(self, tap: TopicTap, publishers: int, reserved: int) -> Kept:
+    async def _collect(self, tap: TopicTap, publishers: int, reserved: int) -> Fetched:
         """Take messages until all that were published before have arrived.
 
         A publisher delivers its messages in order. If there is only one, the newest message of the topic is the last.
@@ -279,7 +279,7 @@ class KeptMessages:
             arrived = self._arrived()
             await asyncio.sleep(POLL_S)
             taken = 0
-            while taken < MOST_KEPT and (message := tap.take()):
+            while taken < MOST_LATCHED and (message := tap.take()):
                 taken += 1
                 sample = Sample(self._topic, self._ready, *message)
                 if sample.sent_ns <= begun_ns:
@@ -290,7 +290,7 @@ class KeptMessages:
                 size += len(sample.cdr)
                 if size > reserved == FIRST_BYTES:
                     raise _TooMuchError
-                while len(samples) > MOST_KEPT or (size > MOST_KEPT_BYTES and len(samples) > 1):
+                while len(samples) > MOST_LATCHED or (size > MOST_LATCHED_BYTES and len(samples) > 1):
                     size -= len(samples.popleft().cdr)
                 if taken % PER_TURN == 0:
                     await asyncio.sleep(0)
@@ -298,4 +298,4 @@ class KeptMessages:
             pause = QUIET_S if newest is None and len(samples) >= publishers else PATIENCE_S
             is_quiet = now - last > (max(pause, REPAIR_S) if self._is_large else pause)
             if is_complete or is_quiet or now - begun > LIMIT_S:
-                return Kept(sorted(samples, key=lambda sample: sample.sent_ns), arrived, max(size, 1))
+                return Fetched(sorted(samples, key=lambda sample: sample.sent_ns), arrived, max(size, 1))
