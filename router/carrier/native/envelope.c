@@ -83,6 +83,15 @@ static bool enter_group(struct walk *walk, const struct wire_type *type, uint32_
     return enter(walk, walk->rest.end, is_known ? &walk->schema->types[field->type] : NULL, number);
 }
 
+/* Skip scalars with a tag of one byte, as most fields are. Stops at any other field, and at a malformed one. */
+static inline void skip_usual_scalars(struct bytes *bytes) {
+    while (bytes->at < bytes->end && *bytes->at >= 1 << 3 && *bytes->at < 0x80) {
+        struct bytes rest = {bytes->at + 1, bytes->end};
+        if (!skip_scalar(&rest, *bytes->at & 7)) return;
+        bytes->at = rest.at;
+    }
+}
+
 static bool read_field(struct walk *walk) {
     const struct level *level = &walk->levels[walk->depth];
     uint32_t tag;
@@ -107,6 +116,7 @@ static bool is_well_formed(const struct wire_schema *schema, const struct wire_t
     walk.depth = 0;
     walk.levels[0] = (struct level){message.end, type, NO_GROUP};
     for (;;) {
+        skip_usual_scalars(&walk.rest);
         if (walk.rest.at < walk.rest.end) {
             if (!read_field(&walk)) return false;
         } else if (walk.levels[walk.depth].group != NO_GROUP) {

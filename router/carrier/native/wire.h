@@ -31,6 +31,10 @@ static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->en
 /* Read a varint of at most `longest` bytes. It may be longer than necessary; bits beyond 64 are dropped. If it is cut or too
  * long, `value` is the part that was read. */
 static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *value) {
+    if (bytes->at < bytes->end && *bytes->at < 0x80) { /* as most are */
+        *value = *bytes->at++;
+        return true;
+    }
     uint64_t read = 0;
     for (unsigned index = 0; index < longest && bytes->at < bytes->end; index++) {
         uint8_t byte = *bytes->at++;
