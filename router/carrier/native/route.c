@@ -141,6 +141,8 @@ static const struct peer *find_peer(const struct listener *listener, uint32_t ad
 }
 
 static const struct payload_case *find_case(const struct program *program, uint32_t number) {
+    /* Most envelopes number their cases from 1 without gaps. */
+    if (number - 1 < program->case_count && program->cases[number - 1].number == number) return &program->cases[number - 1];
     uint32_t low = 0, high = program->case_count;
     while (low < high) {
         uint32_t middle = (low + high) / 2;
