@@ -7,9 +7,9 @@ from functools import cache
 from pathlib import Path
 
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable, RoutePlan
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import HISTOGRAM_CELLS
-from router.compiler.program import Program, RoutePlan
 from tests.envelopes import rover_envelope
 from tests.tables import PROTOS
 
@@ -61,7 +61,7 @@ def _definitions() -> Definitions:
     return Definitions()
 
 
-def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = None) -> Program:
+def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = None) -> CompiledTable:
     """The compiled table. Findings fail the test, except payload cases without a route."""
     path = folder / "table.yaml"
     path.write_text(head.replace("PROTOS", str(protos or PROTOS)) + routes)
@@ -73,7 +73,7 @@ def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = N
 class Ledger:
     """The counters of a program at the time of each call, without timestamps and histograms."""
 
-    def __init__(self, program: Program, counts: Sequence[int]) -> None:
+    def __init__(self, program: CompiledTable, counts: Sequence[int]) -> None:
         self._program = program
         self._counts = counts
 

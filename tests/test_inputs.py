@@ -21,8 +21,8 @@ from router import inputs
 from router.cli import main
 from router.cli.tool_options import named_table, table_path
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from router.errors import StartError
 from router.ros.arguments import Variables, ros_parameters, table_variables
 
@@ -74,7 +74,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     inputs._process.cache_clear()
 
 
-def compiled(known: Program | None = None) -> tuple[Program, Plain]:
+def compiled(known: CompiledTable | None = None) -> tuple[CompiledTable, Plain]:
     with inputs.recording() as read:
         definitions = Definitions(known.protos if known else None)
         checked = check_table(Path("routes/rover.yaml"), None, definitions)

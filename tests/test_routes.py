@@ -9,7 +9,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.rehearsal.rehearsal import Dropped, Published, Rehearsal
 from router.table.model import RouteTable
 from router.table.model.gateways import Transport
@@ -58,7 +58,7 @@ EXISTING_TOPICS = {
 }
 
 
-def program_of(name: str) -> Program:
+def program_of(name: str) -> CompiledTable:
     checked = check_table(ROUTES / name, environ={})
     assert [str(finding) for finding in checked.diagnostics] == []
     assert checked.program is not None
@@ -66,7 +66,7 @@ def program_of(name: str) -> Program:
 
 
 @pytest.fixture(scope="module")
-def rover() -> Program:
+def rover() -> CompiledTable:
     return program_of("rover.yaml")
 
 
@@ -88,7 +88,7 @@ def flow(route: Route) -> tuple[set[str], set[str], bool]:
 
 
 @pytest.mark.parametrize("line", DIRECTIONS.strip().splitlines())
-def test_rover_table_follows_the_list_of_directions(rover: Program, line: str) -> None:
+def test_rover_table_follows_the_list_of_directions(rover: CompiledTable, line: str) -> None:
     case, source, _, target, *rest = line.split()
     ends = {"H": f"{rest[-1] if rest else ''}_board", "B": "basestation", "R": "ros"}
     also = {ends[rest[1][0]]} if "(and" in rest else set()
@@ -98,7 +98,7 @@ def test_rover_table_follows_the_list_of_directions(rover: Program, line: str) -
     assert flow(route) == ({ends[source]}, targets - {"ros"}, "ros" in targets)
 
 
-def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_case(rover: Program) -> None:
+def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_case(rover: CompiledTable) -> None:
     topics = depths(rover.table)
     assert topics.items() >= EXISTING_TOPICS.items()
     for route in rover.table.routes:
@@ -108,7 +108,7 @@ def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_
         assert plain[0] == named or plain[0] in EXISTING_TOPICS
 
 
-def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program) -> None:
+def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: CompiledTable) -> None:
     brakes = ["manual_brake {brake: true}"]
     stops = {
         "drive_motor": (brakes, ("driving_board",), ["manual_drive"]),
@@ -129,7 +129,7 @@ def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program
     assert {name for name, route in routes.items() if route.ttl} == moving
 
 
-def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: Program) -> None:
+def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: CompiledTable) -> None:
     table = program_of("sim.yaml").table
     addresses = [endpoint.address.value for endpoint in table.endpoints.values()]
     addresses += [listener.address.value for listener in table.listeners.values()]
@@ -139,7 +139,7 @@ def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: P
     assert depths(table) == depths(rover.table)
 
 
-def test_a_browser_finds_the_rover_and_can_only_move_a_simulated_one(rover: Program) -> None:
+def test_a_browser_finds_the_rover_and_can_only_move_a_simulated_one(rover: CompiledTable) -> None:
     (watched,), (tried,) = ([*table.gateways.values()] for table in (rover.table, program_of("sim.yaml").table))
     assert (watched.transport.value, watched.inbound) == (Transport.WEBSOCKET, ())
     assert watched.address is not None
@@ -153,7 +153,7 @@ def test_a_browser_finds_the_rover_and_can_only_move_a_simulated_one(rover: Prog
         assert inbound.ttl is not None
 
 
-def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: Program) -> None:
+def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: CompiledTable) -> None:
     table = program_of("legacy.yaml").table
     assert {route.case.value for route in table.routes} == {route.case.value for route in rover.table.routes}
     assert all(flow(route)[:2] == ({"any"}, {"dst_a", "dst_b"}) for route in table.routes)
@@ -161,7 +161,7 @@ def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: 
 
 
 @pytest.fixture
-def published(rover: Program) -> Publish:
+def published(rover: CompiledTable) -> Publish:
     """A function that routes one payload and returns the published messages: CDR bytes by topic."""
 
     def route(case: str, **values: object) -> dict[str, bytes]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from router.carrier.loading import LoadedImage
 from router.carrier.ros_routes import RosRoutes
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 
 if TYPE_CHECKING:
     from router.app.sockets import SocketChange
@@ -23,7 +23,7 @@ class Change:
     `is_first` if no program runs yet.
     """
 
-    program: Program
+    program: CompiledTable
     before: LoadedImage | None
     is_first: bool
     sockets: SocketChange | None = None

@@ -26,7 +26,7 @@ from router.carrier.publishing import PublishThread
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.carrier.ros_routes import RosRoutes
 from router.clock import boottime_ns
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Peer
 from router.errors import ConfigurationError
 from router.image.writer import write_image
@@ -45,7 +45,7 @@ _TURN_S = 0.002
 class Running:
     """A program as the threads execute it."""
 
-    program: Program
+    program: CompiledTable
     image: LoadedImage
 
 
@@ -96,7 +96,7 @@ class Plane:
         counts: ThreadCounts,
         reporter: Reporter,
         of_deadmen: Callable[[DeadmanEvents], None],
-        first: Program,
+        first: CompiledTable,
         head_start: LoadedImage | None = None,
     ) -> None:
         self.now: Running | None = None

@@ -14,8 +14,8 @@ from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked, uncollected
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
 from router.log import fault, logger
 from router.observe.running import ReloadResult
@@ -93,7 +93,7 @@ class Reloader:
                 names = [each.name for each in replaceable]
                 logger.info("these listeners now receive: their networks are up", listeners=names)
 
-    def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
+    def _attempt(self, now: CompiledTable) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
         try:
@@ -126,7 +126,7 @@ class Reloader:
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
 
-    def _check(self, now: Program) -> Checked:
+    def _check(self, now: CompiledTable) -> Checked:
         """Check the table once none of its files is being written. Raises StartError after a timeout, or OSError."""
         until = monotonic_ns() + round(UNCHANGED_TIMEOUT * 1e9)
         wait_until_unchanged(watched_files(now.table), until)
@@ -181,7 +181,7 @@ def _node(node: NodeSettings) -> object:
     return node.name, node.namespace, node.diagnostics is not None
 
 
-def _changes(before: Program, after: Program) -> str:
+def _changes(before: CompiledTable, after: CompiledTable) -> str:
     """Describe a reload in one line, for example `route imu_info changed, endpoint arm_board added`."""
     now, then = before.table, after.table
     found = [

@@ -20,8 +20,8 @@ from router.app.watching import InterfaceWatcher, Watcher, watched_files
 from router.carrier.events import DeadmanChange, DeadmanEvents
 from router.carrier.forwarding import Forwarding
 from router.clock import boottime_ns
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Evidence, Mismatch
-from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
 from router.library import library
 from router.log import logger
@@ -66,7 +66,7 @@ class Router:
 
     def __init__(
         self,
-        program: Program,
+        program: CompiledTable,
         ros_args: Sequence[str] = (),
         environ: Mapping[str, str] | None = None,
         head_start: HeadStart | None = None,
@@ -92,7 +92,7 @@ class Router:
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._known: Mapping[str, int] = dict.fromkeys(program.table.endpoints, boottime_ns())
-        self._readings: tuple[Program, Readings] | None = None
+        self._readings: tuple[CompiledTable, Readings] | None = None
         self._open = StopStack()
 
     def __enter__(self) -> Router:
@@ -149,7 +149,7 @@ class Router:
         return endpoint.address.value if endpoint else None
 
     @property
-    def program(self) -> Program:
+    def program(self) -> CompiledTable:
         """The running program; a reload replaces it."""
         return self._runtime.program or self._first
 
@@ -281,13 +281,13 @@ class Router:
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
-    def _current_readings(self) -> tuple[Program, Readings]:
+    def _current_readings(self) -> tuple[CompiledTable, Readings]:
         if (made := self._readings) is None or made[0] is not self.program:
             program = self.program
             made = self._readings = (program, self._new_readings(program))
         return made
 
-    def _new_readings(self, program: Program) -> Readings:
+    def _new_readings(self, program: CompiledTable) -> Readings:
         # Use this program's counters: those of the running program are adopted only once no thread is stuck.
         totals, now = partial(self._counts.totals, program.counters.latest()), boottime_ns()
         self._known = {name: self._known.get(name, now) for name in program.table.endpoints}

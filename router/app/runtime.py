@@ -31,8 +31,8 @@ from router.app.plane import Images, Plane
 from router.app.sockets import KernelDrops, Sockets
 from router.app.topics import Topics, needs_ros
 from router.carrier.forwarding import Forwarding
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.extras import missing_extras
-from router.compiler.program import Program
 from router.errors import ConfigurationError
 from router.log import fault, logger
 from router.net.dds import clashes, discovers_by_multicast
@@ -66,7 +66,7 @@ class Runtime:
         self._unfinished: list[Change] = []
 
     @property
-    def program(self) -> Program | None:
+    def program(self) -> CompiledTable | None:
         """The running program."""
         return self.plane.now.program if self.plane.now else None
 
@@ -83,7 +83,7 @@ class Runtime:
 
     # adoption of a program
 
-    def start(self, program: Program) -> Change:
+    def start(self, program: CompiledTable) -> Change:
         """Adopt the first program, then open its gateways, which takes longer. Raises StartError: then close it."""
         with background_threads():
             change = self._prepare(program)
@@ -93,7 +93,7 @@ class Runtime:
             self.finish(change)
         return change
 
-    def prepare(self, program: Program) -> Change:
+    def prepare(self, program: CompiledTable) -> Change:
         """Open what `program` needs that is not open yet. Raises StartError with nothing changed."""
         if self._unfinished and self.plane.wait_until_adopted():
             self._finish_all()  # before `program` opens the same addresses or topics
@@ -104,7 +104,7 @@ class Runtime:
             undo.pop_all()
         return change
 
-    def _prepare(self, program: Program) -> Change:
+    def _prepare(self, program: CompiledTable) -> Change:
         for missing in missing_extras(program.table):
             raise missing
         _check_ports(program, os.environ)
@@ -154,7 +154,7 @@ class Runtime:
                 for each in (self.counts, self.sockets, self._images, self.topics):
                     up.callback(each.finish, change)
 
-    def take_over(self, program: Program) -> None:
+    def take_over(self, program: CompiledTable) -> None:
         """Adopt a program: the whole of a reload. Raises StartError, StuckError or OSError with nothing changed.
 
         A failure after the adoption is a bug and is logged.
@@ -204,7 +204,7 @@ class Runtime:
             self.sockets.close_listeners()
 
 
-def _check_ports(program: Program, variables: Mapping[str, str]) -> None:
+def _check_ports(program: CompiledTable, variables: Mapping[str, str]) -> None:
     """Warn of UDP ports that ROS uses. Raises ConfigurationError for one without which ROS in this router is blind."""
     for clash in clashes(program, variables):
         if clash.blinds and needs_ros(program) and discovers_by_multicast(variables):

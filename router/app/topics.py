@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from router.app.change import Change
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import PUBLISHER, SHARES_NODE, SHARES_TOPIC, SUBSCRIBER
-from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
 from router.errors import ConfigurationError, SourceSpan, StartError
 from router.ros.environment import check_environment, ros_remedy
@@ -32,7 +32,7 @@ class Topics:
         subscriber_joined: Callable[[str], None],
     ) -> None:
         self.node: RouterNode | None = None
-        self._program: Program | None = None
+        self._program: CompiledTable | None = None
         self._opened_for: Change | None = None
         self._ros_args = ros_args
         self._report_incompatible = incompatible
@@ -45,7 +45,7 @@ class Topics:
 
     # adoption of another program
 
-    def check(self, program: Program) -> None:
+    def check(self, program: CompiledTable) -> None:
         """Check what opening ROS may fail for, before deadmen send. Raises StartError."""
         if self.node is None and needs_ros(program):
             check_environment(os.environ)
@@ -78,7 +78,7 @@ class Topics:
         if self.node is not None and change.ros is not None:
             self.node.finish(change.ros)
 
-    def _open_node(self, program: Program) -> RouterNode:
+    def _open_node(self, program: CompiledTable) -> RouterNode:
         """Open a node without any topic. Raises StartError."""
         try:
             from router.ros.router_node import RouterNode
@@ -86,7 +86,7 @@ class Topics:
             raise _missing_ros(program, error) from error
         return RouterNode(program.table.node, (), (), {}, self._ros_args, self._incompatible, self._subscriber_joined)
 
-    def _check_arguments(self, program: Program) -> None:
+    def _check_arguments(self, program: CompiledTable) -> None:
         """Check the arguments. Loads ROS, which takes a while, only if there are any. Raises StartError."""
         if len(self._ros_args) > 1:
             try:
@@ -145,16 +145,16 @@ class Topics:
             yield (f"/{self.node.name}",), self.node.surroundings.namesakes
 
 
-def needs_ros(program: Program) -> bool:
+def needs_ros(program: CompiledTable) -> bool:
     return bool(program.publishers or program.subscriptions or program.gateways)
 
 
-def _missing_ros(program: Program, error: ImportError) -> StartError:
+def _missing_ros(program: CompiledTable, error: ImportError) -> StartError:
     kind = StartError if is_shortage(error) else ConfigurationError
     return kind(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
 
 
-def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
+def _topic_spans(program: CompiledTable) -> Mapping[str, SourceSpan]:
     """Return the position in the table of each topic, by ROS name."""
     table = program.table
     spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.all_topics}
@@ -166,7 +166,7 @@ def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
     return spans
 
 
-def _uses_of_topics(program: Program) -> Mapping[tuple[str, str, str], bool]:
+def _uses_of_topics(program: CompiledTable) -> Mapping[tuple[str, str, str], bool]:
     """Return the routes and gateways that use a topic, with the peers that they need there: (route, topic, peer).
 
     The value says whether the messages are commands.
@@ -186,7 +186,7 @@ def _uses_of_topics(program: Program) -> Mapping[tuple[str, str, str], bool]:
     return uses
 
 
-def _users_of_topics(program: Program) -> Mapping[str, Sequence[str]]:
+def _users_of_topics(program: CompiledTable) -> Mapping[str, Sequence[str]]:
     """Return the routes and gateways that name each topic, by ROS name."""
     names: dict[str, list[str]] = {}
     for route in program.table.routes:

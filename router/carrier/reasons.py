@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from router import datagrams
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.declared import DropReason, Reason
 from router.table.model.endpoints import Framing
 
@@ -17,7 +17,7 @@ DROP_REASON_NAMES = tuple(reason.name.lower() for reason in DropReason)
 """The names of `metrics.DROP_REASONS`, by `enum drop_reason`."""
 
 
-def why_rejected(program: Program, listener: str, data: bytes, length: int) -> str:
+def why_rejected(program: CompiledTable, listener: str, data: bytes, length: int) -> str:
     """Describe why a datagram of `length` bytes was rejected; `data` is all of it or its beginning."""
     plan = program.table.listeners.get(listener)
     if plan is None:
@@ -26,7 +26,7 @@ def why_rejected(program: Program, listener: str, data: bytes, length: int) -> s
     return datagrams.why_rejected(program.envelope, data, length, repairs=repairs)
 
 
-def superseded(program: Program, listener: str, data: bytes) -> str:
+def superseded(program: CompiledTable, listener: str, data: bytes) -> str:
     """Describe the payloads of a datagram that has several: `manual_drive, then drive_motor`."""
     plan = program.table.listeners.get(listener)
     if plan is None:
@@ -34,7 +34,7 @@ def superseded(program: Program, listener: str, data: bytes) -> str:
     return ", then ".join(datagrams.payloads(program.envelope, data, repairs=plan.framing is Framing.ZERO_TRIMMED))
 
 
-def where_refused(program: Program, route: str, topic: str | None, target: str, place: int) -> str:
+def where_refused(program: CompiledTable, route: str, topic: str | None, target: str, place: int) -> str:
     """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
     (plan,) = (plan for plan in program.routes if (plan.route, plan.topic) == (route, topic))
     by_label = {to.label: to for to in plan.targets if to.places}  # a topic rather than an endpoint of the same name

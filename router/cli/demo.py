@@ -22,7 +22,7 @@ from router.cli.init import FIRST_TABLE
 from router.cli.tool_options import good_table, say
 
 if TYPE_CHECKING:
-    from router.compiler.program import Program
+    from router.compiler.compiled_table import CompiledTable
 
 _DESCRIPTION = """Simulate the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
 Nothing leaves this computer. The first lines show the addresses for a browser and Foxglove, and a command for another
@@ -58,7 +58,7 @@ def _table() -> Path:
 
 
 @contextmanager
-def _simulated(program: Program) -> Iterator[Callable[[], None]]:
+def _simulated(program: CompiledTable) -> Iterator[Callable[[], None]]:
     """Simulate the table's endpoints in a thread, which sends once the returned function is called: what is sent while
     the router starts becomes stale. An error there stops the process like SIGTERM and is raised here.
 

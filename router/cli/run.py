@@ -23,7 +23,7 @@ from router.log import configure_log, logger
 if TYPE_CHECKING:
     from router.app import Router
     from router.app.image_saver import ImageSaver
-    from router.compiler.program import Program
+    from router.compiler.compiled_table import CompiledTable
     from router.startup_image.head_start import HeadStartAttempt
     from router.table.addresses import Address
     from router.table.model.gateways import Gateway
@@ -115,7 +115,7 @@ def _table(args: argparse.Namespace, name: str, parameter: str | None) -> Path:
 
 
 def route(
-    program: Program,
+    program: CompiledTable,
     ros_args: Sequence[str],
     environ: Mapping[str, str],
     attempt: HeadStartAttempt | None = None,

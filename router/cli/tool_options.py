@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
     from router.compiler import Checked
+    from router.compiler.compiled_table import CompiledTable
     from router.compiler.lookup import Definitions
     from router.compiler.metrics import Counters
-    from router.compiler.program import Program
     from router.datagrams import Wire
     from router.table.model import RouteTable
     from router.tools.tap import ShownAction, TappedDatagram, TappedMessage
@@ -81,7 +81,7 @@ def good_table(
     environ: Mapping[str, str] | None = None,
     definitions: Definitions | None = None,
     counters: Counters | None = None,
-) -> tuple[Checked, Program]:
+) -> tuple[Checked, CompiledTable]:
     """Check a table and print its warnings. The program counts in `counters`. Raises TableError if there are errors."""
     from router.cli.findings import print_findings
     from router.compiler import check_table

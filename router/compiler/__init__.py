@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from router.compiler.check import Checked, check_table
-from router.compiler.program import STRANGER, source_label
+from router.compiler.compiled_table import STRANGER, source_label
 
 __all__ = ["check_table", "Checked", "STRANGER", "source_label"]

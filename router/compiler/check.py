@@ -14,12 +14,12 @@ from pathlib import Path
 
 from router.compiler.brakes import brake_findings
 from router.compiler.checked import CheckedRoute
+from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
 from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
-from router.compiler.program import GatewayPlan, Program
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Code, Diagnostic, Severity, TableError
@@ -65,12 +65,12 @@ class Checked:
         return _has_errors(self.diagnostics)
 
     @cached_property
-    def program(self) -> Program | None:
+    def program(self) -> CompiledTable | None:
         """The program, compiled on first use; None if there are errors."""
         return self.program_in(Counters())
 
     @uncollected()
-    def program_in(self, counters: Counters) -> Program | None:
+    def program_in(self, counters: Counters) -> CompiledTable | None:
         """Compile the program, which counts in `counters`; None if there are errors.
 
         A program that replaces another one continues its counters (`Counters.continued`).

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from router.compiler.compiled_table import DeadmanPlan, ObeyedPlan
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
-from router.compiler.program import DeadmanPlan, ObeyedPlan
 from router.errors import SourceSpan
 from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.routes import Route

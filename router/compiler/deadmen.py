@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.constants import envelope_of
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.feeds import feeding, require_hand_over, successors
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.plan import Record
-from router.compiler.program import DeadmanPlan
 from router.declared import MOST_DESTINATIONS
 from router.errors import Code, Diagnostic, FindingError, Located, SourceSpan
 from router.table.model.expressions import FieldMap

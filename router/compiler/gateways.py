@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from router.compiler.compiled_table import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.constants import cdr_of
 from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
 from router.compiler.lookup import Lookup
-from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.selection import pattern_problem
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, FindingError

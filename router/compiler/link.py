@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
+from router.compiler.compiled_table import STRANGER, CompiledTable, GatewayPlan, RoutePlan, TopicPlan
 from router.compiler.lookup import definitions_of
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
-from router.compiler.program import STRANGER, GatewayPlan, Program, RoutePlan, TopicPlan
 from router.compiler.series import open_series
 from router.compiler.topics import qos_of
 from router.table.model import RouteTable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from router.compiler.check import Checked
 
 
-def link(checked: Checked, counters: Counters) -> Program | None:
+def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     """Make the program of a table, which counts in `counters`; None if the table has errors."""
     table, schema, envelope, lowered = checked.table, checked.schema, checked.envelope, checked.lowered
     if table is None or schema is None or envelope is None or lowered is None:
@@ -42,7 +42,7 @@ def link(checked: Checked, counters: Counters) -> Program | None:
     deadmen = tuple(route.deadman for route in served if route.deadman)
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
-    program = Program(
+    program = CompiledTable(
         table=table,
         envelope=envelope,
         counters=counters,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from router.compiler.compiled_table import ObeyedPlan
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.expressions.tree import Node, Present, Read, parts_of
 from router.compiler.lookup import Lookup
-from router.compiler.program import ObeyedPlan
 from router.errors import Code, Located
 from router.table.model.routes import ANY, Deadman, Obeyed, Route
 from router.table.units import duration

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, GatewayPlan, RoutePlan, source_label
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
@@ -21,13 +22,12 @@ from router.compiler.metrics import (
     UNSAVED_REASONS,
     Counters,
 )
-from router.compiler.program import STRANGER, DeadmanPlan, GatewayPlan, Program, RoutePlan, source_label
 from router.table.model import RouteTable
 from router.table.model.routes import ROS
 from router.types.protobuf import Envelope
 
 
-def open_series(program: Program) -> None:
+def open_series(program: CompiledTable) -> None:
     """Open the series of a program in its counters."""
     counters, table = program.counters, program.table
     _open_listeners(counters, table, program.envelope)

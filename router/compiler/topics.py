@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-from router.compiler.program import QosPlan
+from router.compiler.compiled_table import QosPlan
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.keys import keys_of
 from router.table.model import RouteTable

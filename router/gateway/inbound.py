@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from router.carrier.limits import Freshness, RateLimit
+from router.compiler.compiled_table import GatewayPlan, InboundPlan
 from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters, Report
-from router.compiler.program import GatewayPlan, InboundPlan
 from router.gateway.documents import PublishRequest, SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.json_codec import InvalidMessageError, decoder

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 
-from router.compiler.program import GatewayPlan
+from router.compiler.compiled_table import GatewayPlan
 from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import boottime_ns, wall_ns
+from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.metrics import Report
-from router.compiler.program import GatewayPlan, Program
 from router.errors import StartError
 from router.gateway.clients import ClientQueue
 from router.gateway.context import GatewayContext
@@ -96,7 +96,7 @@ class GatewayThread:
         self._context = GatewayContext(self._subscriptions, self._converting, failed, boottime_ns, wall_ns)
         self._thread.start()
 
-    def prepare(self, program: Program, feed: Mapping[str, Callable[[int], None]]) -> GatewayChange:
+    def prepare(self, program: CompiledTable, feed: Mapping[str, Callable[[int], None]]) -> GatewayChange:
         """Open the gateways of `program` that are not open yet. Raises StartError; then nothing has changed.
 
         `feed` has the functions that feed deadmen, by the deadman's route. An unchanged gateway keeps its clients. A
@@ -113,7 +113,7 @@ class GatewayThread:
         )
         return self._call(self._prepare(program, outputs))
 
-    async def _prepare(self, program: Program, outputs: InboundOutputs) -> GatewayChange:
+    async def _prepare(self, program: CompiledTable, outputs: InboundOutputs) -> GatewayChange:
         kept = {
             plan.settings.name: service
             for plan in program.gateways
@@ -170,7 +170,7 @@ class GatewayThread:
         for service in change.opened:
             service.start()
 
-    async def _open(self, plan: GatewayPlan, program: Program, outputs: InboundOutputs) -> GatewayService:
+    async def _open(self, plan: GatewayPlan, program: CompiledTable, outputs: InboundOutputs) -> GatewayService:
         settings, counters = plan.settings, program.counters
         http = program.table.http.address.value if program.table.http else None  # fixed while the router runs
         gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, boottime_ns)

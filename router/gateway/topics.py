@@ -10,7 +10,7 @@ from functools import partial
 from itertools import chain, count, repeat
 from math import inf
 
-from router.compiler.program import GatewayPlan
+from router.compiler.compiled_table import GatewayPlan
 from router.compiler.selection import TopicSelector
 from router.errors import StartError
 from router.gateway.clients import ClientQueue, Clients

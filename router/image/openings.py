@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from router import declared as c
 from router.compiler.checked import Target
+from router.compiler.compiled_table import CompiledTable, DeadmanPlan, RoutePlan, TopicPlan
 from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan, Program, RoutePlan, TopicPlan
 from router.image.memory import Symbols
 from router.image.names import Names
 
@@ -33,7 +33,7 @@ def period(hertz: float) -> int:
 class Openings:
     """Lists the objects to open, as `Image.openings`. The methods that return addresses return symbols."""
 
-    program: Program
+    program: CompiledTable
     names: Names
     symbols: Symbols = field(default_factory=Symbols)
     listed: dict[Symbol, tuple[Symbol, str, tuple[Any, ...], tuple[Any, ...], bool]] = field(default_factory=dict)

@@ -9,10 +9,10 @@ from typing import Any
 
 from router import declared as c
 from router.compiler.checked import Target
+from router.compiler.compiled_table import STRANGER, CompiledTable, RoutePlan, source_label
 from router.compiler.lowering import LoweredCollect, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
-from router.compiler.program import STRANGER, Program, RoutePlan, source_label
 from router.image.openings import Openings, period
 from router.table.model.targets import OnLimit, TargetKeys
 
@@ -36,7 +36,7 @@ class Timer:
 class TargetWriter:
     """Writes the targets of a table to `arrays`. `timers` are those of deferrals and collectors."""
 
-    program: Program
+    program: CompiledTable
     openings: Openings
     arrays: Arrays
     boards: Mapping[str, ctypes._Pointer[c.Board]]

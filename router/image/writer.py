@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from router import declared as c
+from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, RoutePlan, source_label
 from router.compiler.lowering import LoweredElements, LoweredFeed
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers, sent_from
-from router.compiler.program import STRANGER, DeadmanPlan, Program, RoutePlan, source_label
 from router.declared import NONE
 from router.image.boards import write_boards
 from router.image.image import Image
@@ -29,7 +29,7 @@ from router.table.model.endpoints import Endpoint, EndpointKind, Framing
 _REJECT_REASONS = [reason.name.lower() for reason in c.Reason]
 
 
-def write_image(program: Program, names: Names | None = None) -> Image:
+def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     """Write the image of a table. It adds to `names`, the names of the process. Equal tables have equal images."""
     names, arrays = names or Names(), Arrays()
     openings = Openings(program, names)
@@ -96,7 +96,7 @@ def _pause(endpoint: Endpoint) -> int:
 class _Writer:
     """Writes what the receive thread executes: listeners, payload cases, and routes from UDP."""
 
-    program: Program
+    program: CompiledTable
     targets: TargetWriter
     numbers: Mapping[str, int]
     """Numbers of the routes."""

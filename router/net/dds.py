@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import SourceSpan
 from router.net.kernel import FIRST_OF_ROS
 from router.table.addresses import Address
@@ -36,7 +36,7 @@ class Clash(NamedTuple):
         return f"{self.owner} has {self.address}, a port that a ROS process of this computer may take first"
 
 
-def clashes(program: Program, variables: Mapping[str, str]) -> Iterator[Clash]:
+def clashes(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[Clash]:
     """Yield the UDP addresses of listeners and gateways with a port of DDS in the domain of the environment."""
     if (domain := _domain(variables)) is None:
         return

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from router.clock import wall_ns
 from router.compiler.cdr import HEADER, put_length, put_text
-from router.compiler.program import GatewayPlan
+from router.compiler.compiled_table import GatewayPlan
 from router.log import logger
 from router.observe import problems
 from router.observe.health import PERIOD, HealthSnapshot

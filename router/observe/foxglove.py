@@ -27,7 +27,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from router.clock import wall_ns
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.log import FloodLog, fault, logger_of_library
 from router.net.doors import Door, is_foreign, listen
 from router.observe.running import Running
@@ -77,7 +77,7 @@ def _key(case: PayloadCase) -> _ChannelKey:
 class _View(NamedTuple):
     """A program, and the numbers of its channels by the field number of the payload case."""
 
-    program: Program
+    program: CompiledTable
     classifier: Classifier
     channels: Mapping[int, int]
 
@@ -300,7 +300,7 @@ class FoxgloveServer:
             if added:
                 client.order(op="advertise", channels=added)
 
-    def _view_of(self, program: Program) -> _View:
+    def _view_of(self, program: CompiledTable) -> _View:
         channels = {}
         for case in program.envelope.cases.values():
             key = _key(case)

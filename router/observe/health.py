@@ -38,7 +38,7 @@ from router.table.model.routes import ANY
 from router.values.printing import age_text
 
 if TYPE_CHECKING:
-    from router.compiler.program import Program
+    from router.compiler.compiled_table import CompiledTable
 
 PERIOD = 1.0
 """Seconds between two snapshots."""
@@ -138,7 +138,7 @@ class HealthSnapshot:
     commands, by route. `returned`: how long ago each endpoint was heard again after its last silence.
     """
 
-    program: Program
+    program: CompiledTable
     snapshots: Sequence[Snapshot]
     stalled_for: float
     tripped: Mapping[str, float]

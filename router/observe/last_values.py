@@ -11,7 +11,7 @@ from time import monotonic
 from typing import Any
 
 from router.clock import boottime_ns
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, payload_number
 from router.threads import Thread
@@ -40,7 +40,7 @@ class LastValues:
         self._newest_lock = threading.Lock()
         self._closing = threading.Event()
 
-    def of(self, program: Program) -> Mapping[str, Value]:
+    def of(self, program: CompiledTable) -> Mapping[str, Value]:
         """Return `at` (boot clock, s), `source`, `bytes` and `fields` by payload case; nothing at the first request."""
         with self._lock:
             self._until = monotonic() + LOOKED_AT_SECONDS

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from google.protobuf.message import Message
 
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Evidence
-from router.compiler.program import Program
 from router.datagrams import Wire
 from router.errors import DecodeError, listed
 from router.log import logger
@@ -51,12 +51,12 @@ class Obedience:
         with self._lock:
             self._replies = {key: reply for key, reply in self._replies.items() if key[0] != route}
 
-    def note(self, evidence: Evidence, program: Program) -> None:
+    def note(self, evidence: Evidence, program: CompiledTable) -> None:
         """Note what a board says while it does not obey."""
         if said := _read_fields(evidence, program):
             self._set(evidence.route, evidence.endpoint, Reply(None, said))
 
-    def answered(self, answer: Answer, program: Program) -> None:
+    def answered(self, answer: Answer, program: CompiledTable) -> None:
         """Note and log that a board obeys, or does not."""
         after, place = f"{answer.after / 1e9:.2f} s", {"route": answer.route, "board": answer.endpoint}
         if answer.obeys:
@@ -72,7 +72,7 @@ class Obedience:
             self._replies[route, board] = reply
 
 
-def why_disobeyed(program: Program, route: str, board: str, replies: Replies) -> str:
+def why_disobeyed(program: CompiledTable, route: str, board: str, replies: Replies) -> str:
     """Return what the deadman of a route sends, and what the board says to that."""
     deadman = next((each.deadman for each in program.table.routes if each.name == route), None)
     if deadman is None or deadman.obeyed is None:  # a reload has removed it meanwhile
@@ -82,7 +82,7 @@ def why_disobeyed(program: Program, route: str, board: str, replies: Replies) ->
     return f"it was sent {sent}, and {f'says {said}' if said else f'has sent no {case} since'}"
 
 
-def _read_fields(evidence: Evidence, program: Program) -> str:
+def _read_fields(evidence: Evidence, program: CompiledTable) -> str:
     """Return the fields that the condition of `obeyed` reads in a datagram, on one line."""
     try:
         decoded = Wire(program.envelope).decode(evidence.data)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from router.clock import boottime_ns
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
-from router.compiler.program import DeadmanPlan
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.udp import why_not_sent
 from router.table.addresses import Address

@@ -10,8 +10,8 @@ import enum
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import CLIENTS
-from router.compiler.program import Program
 from router.compiler.topics import resolved
 from router.errors import listed
 from router.table.keys import phrases
@@ -85,7 +85,7 @@ def nodes_and_edges(table: RouteTable) -> tuple[list[Node], list[Edge]]:
     return list(nodes.values()), edges
 
 
-def deadman_edges(program: Program) -> Iterator[Edge]:
+def deadman_edges(program: CompiledTable) -> Iterator[Edge]:
     """Yield edges for what deadmen send in place of commands, counted by `deadman_datagrams_sent{route,
     destination=label}`.
     """

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Mismatch
-from router.compiler.program import Program
 from router.errors import Diagnostic
 from router.observe.obedience import Replies
 from router.observe.snapshot import SERIES, Snapshot
@@ -30,7 +30,7 @@ class Running(Protocol):
     mirror: Mirror
 
     @property
-    def program(self) -> Program:
+    def program(self) -> CompiledTable:
         """The running program; a reload replaces it."""
 
     @property

@@ -11,7 +11,7 @@ from router.compiler.metrics import Mismatch
 from router.table.model.routes import ANY
 
 if TYPE_CHECKING:
-    from router.compiler.program import Program
+    from router.compiler.compiled_table import CompiledTable
 
 MOST_NAMED = 3
 """Maximum routes or senders that a text names."""
@@ -20,7 +20,7 @@ MOST_NAMED = 3
 class Senders:
     """The senders of `mismatches`, judged by a program."""
 
-    def __init__(self, program: Program, mismatches: AbstractSet[Mismatch]) -> None:
+    def __init__(self, program: CompiledTable, mismatches: AbstractSet[Mismatch]) -> None:
         self._program = program
         self._mismatches = sorted(mismatches)
 

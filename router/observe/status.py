@@ -6,8 +6,8 @@ from dataclasses import asdict
 from typing import Any
 
 from router.clock import boottime_ns
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import INTENDED_REASONS
-from router.compiler.program import Program
 from router.observe.last_values import LastValues
 from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
@@ -152,7 +152,7 @@ def _steps(metric: str, path: str) -> tuple[str | int, ...]:
 _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
-def _map_json(program: Program) -> Json:
+def _map_json(program: CompiledTable) -> Json:
     """Return the map.
 
     `pages`: gateways with a page for browsers, and the addresses they listen on. `deadmen`: edges with what deadmen

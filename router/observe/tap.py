@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import RouterError, TransportError, did_you_mean
 from router.recording.mirror import Acted, Action, Mirror, Mirrored, MirroredDatagram, payload_number
 
@@ -56,7 +56,7 @@ class TapRequestError(RouterError):
 
 
 def wanted(
-    program: Program, cases: Sequence[str], sources: Sequence[str], decisions: Sequence[str] = ()
+    program: CompiledTable, cases: Sequence[str], sources: Sequence[str], decisions: Sequence[str] = ()
 ) -> Wanted | None:
     """Return a filter for datagrams of these payload cases, sources and decisions; None if all are wanted.
 
@@ -82,7 +82,7 @@ def _of_decision(decisions: Sequence[str]) -> Wanted:
     return is_wanted
 
 
-def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
+def _of_case(program: CompiledTable, cases: Sequence[str]) -> Wanted:
     known = program.envelope.cases
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
@@ -96,7 +96,7 @@ def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
     return is_wanted
 
 
-def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
+def _from_source(program: CompiledTable, sources: Sequence[str]) -> Wanted:
     endpoints = program.table.endpoints
     if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
         raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")

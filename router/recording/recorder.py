@@ -16,7 +16,7 @@ from io import BytesIO
 from pathlib import Path
 
 from router.clock import boottime_ns, wall_ns
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import RouterError
 from router.log import fault, logger
 from router.recording.about import about, reason_of
@@ -102,7 +102,7 @@ class Recorder:
     `program` returns the running program, which a reload replaces.
     """
 
-    def __init__(self, mirror: Mirror, program: Callable[[], Program], settings: RecordSettings) -> None:
+    def __init__(self, mirror: Mirror, program: Callable[[], CompiledTable], settings: RecordSettings) -> None:
         self._mirror = mirror
         self._running_program = program
         self._settings = settings

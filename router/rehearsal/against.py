@@ -9,7 +9,7 @@ from hashlib import blake2b
 from typing import NamedTuple, Union
 
 from router.compiler import Checked
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Peer, Wire
 from router.errors import DecodeError, MappingError
 from router.recording.mirror import Classifier
@@ -58,7 +58,7 @@ class Against:
     addresses.
     """
 
-    def __init__(self, old: Program, new: Program) -> None:
+    def __init__(self, old: CompiledTable, new: CompiledTable) -> None:
         self.rows: dict[tuple[str, str], Row] = {}
         self.losses: tuple[Counter[Loss], Counter[Loss]] = (Counter(), Counter())
         self.datagrams = 0

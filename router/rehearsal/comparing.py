@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from router.compiler import Checked
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
@@ -55,7 +55,7 @@ class Outcome:
 class Comparison:
     """Compares the steps of the tests of one table; `describer` describes events."""
 
-    def __init__(self, checked: Checked, program: Program) -> None:
+    def __init__(self, checked: Checked, program: CompiledTable) -> None:
         self._wire = Wire(program.envelope)
         self.describer = EventDescriber(checked, program)
         self._index = self.describer.index

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute, Target
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.expressions.tree import Node
-from router.compiler.program import Program
 from router.errors import SourceSpan
 from router.rehearsal.comparing import Outcome
 from router.rehearsal.rehearsal import (
@@ -48,7 +48,7 @@ class Item:
 class Coverage:
     """The coverage of one table by the tests of a file, and by those of others that are added."""
 
-    def __init__(self, checked: Checked, program: Program) -> None:
+    def __init__(self, checked: Checked, program: CompiledTable) -> None:
         self.path: Path = checked.path
         self._items: dict[Key, Item] = {}
         self._touched: set[Key] = set()
@@ -94,7 +94,7 @@ def _real(span: SourceSpan) -> SourceSpan:
 # What there is to touch
 
 
-def _items(checked: Checked, program: Program) -> Iterator[tuple[Key, Item]]:
+def _items(checked: Checked, program: CompiledTable) -> Iterator[tuple[Key, Item]]:
     routes = [route for route in checked.routes if not route.route.ignore]
     for route in routes:
         name = route.route.name

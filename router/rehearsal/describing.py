@@ -8,8 +8,8 @@ from itertools import groupby
 
 from router.compiler import Checked
 from router.compiler.checked import Target
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
-from router.compiler.program import Program
 from router.datagrams import Wire
 from router.errors import DecodeError, SourceSpan
 from router.rehearsal import cdr
@@ -114,7 +114,7 @@ def _filled(plan: Plan, path: Path) -> SourceSpan | None:
 class EventDescriber:
     """Describes what happened to messages of one table. `index` finds its places."""
 
-    def __init__(self, checked: Checked, program: Program) -> None:
+    def __init__(self, checked: Checked, program: CompiledTable) -> None:
         self.index = TableIndex(checked)
         self._wire = Wire(program.envelope)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from router.compiler import Checked, check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from router.errors import (
     Code,
     Diagnostic,
@@ -51,7 +51,7 @@ class TestFile:
     __test__ = False  # for pytest, which would take this for a class of tests
 
     checked: Checked
-    program: Program
+    program: CompiledTable
     tests: tuple[TableTest, ...]
 
 

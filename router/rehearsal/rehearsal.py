@@ -1,6 +1,6 @@
 """A program on a simulated clock: messages go in, a list of events comes out.
 
-The library that drives the rover executes it (`carrier.rehearsal`). Every topic has a subscriber,
+The library that drives the rover executes it (`carrier.simulation`). Every topic has a subscriber,
 and the network accepts everything. Gateways do not take part, and deadmen do not send at the start.
 """
 
@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from router.carrier.events import CountedReport, DeadmanChange
-from router.carrier.rehearsal import Increment, Output, Stage, Time
+from router.carrier.simulation import Increment, Output, Simulation, Time
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Series
-from router.compiler.program import Program
 from router.datagrams import Peer
 from router.library import library
 
@@ -149,19 +149,19 @@ class Rehearsal:
     caller may clear it. The same calls give the same events.
     """
 
-    def __init__(self, program: Program, start_ns: int = START) -> None:
+    def __init__(self, program: CompiledTable, start_ns: int = START) -> None:
         """Start the program. Raises StartError if the carrier's library is missing."""
         self.events: list[Event] = []
-        self._stage = Stage(library(), start_ns)
+        self._simulation = Simulation(library(), start_ns)
         self._start = self._at = start_ns
         self.ahead = 0
         self._data = b""
-        self._stage.adopt(program)
+        self._simulation.adopt(program)
         self._series = _series(program)
 
     @property
     def now(self) -> int:
-        return self._stage.now
+        return self._simulation.now
 
     @property
     def _wall(self) -> int:
@@ -169,43 +169,43 @@ class Rehearsal:
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
         """Receive a datagram that waited in the socket since `arrived_ns`. Raises KeyError for an unknown listener."""
-        self._stage.datagram(listener, peer, data, self._wall if arrived_ns is None else arrived_ns)
+        self._simulation.datagram(listener, peer, data, self._wall if arrived_ns is None else arrived_ns)
         self._read()
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
         """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        self._stage.message(topic, cdr, self._wall if sent_ns is None else sent_ns)
+        self._simulation.message(topic, cdr, self._wall if sent_ns is None else sent_ns)
         self._read()
 
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns` and serve the timers that are due by then. Never goes back."""
-        self._stage.advance(to_ns)
+        self._simulation.advance(to_ns)
         self._read()
 
     def set_clock(self, ahead_ns: int) -> None:
         """Set the wall clock to this many ns ahead of the boot clock."""
         self.ahead = ahead_ns
-        self._stage.set_clock(ahead_ns)
+        self._simulation.set_clock(ahead_ns)
 
-    def reload(self, program: Program) -> None:
+    def reload(self, program: CompiledTable) -> None:
         """Continue with another program, whose counters continue those of the current one."""
-        self._stage.adopt(program)
+        self._simulation.adopt(program)
         self._series |= _series(program)
         self._read()
 
     def restart(self) -> None:
         """Start again with the current program, as a router that has just started."""
-        self._stage.restart(self._start)
+        self._simulation.restart(self._start)
         self._at, self.ahead, self._data = self._start, 0, b""
         self.events.clear()
 
     def close(self) -> None:
         """Stop as the router does: end frames, send what waits, and let armed deadmen send last."""
-        self._stage.end()
+        self._simulation.end()
         self._read()
 
     def _read(self) -> None:
-        for record in self._stage.records():
+        for record in self._simulation.records():
             match record:
                 case Time(at):
                     self._at = at
@@ -234,6 +234,6 @@ class Rehearsal:
             self.events[-1] = replace(event, detail=detail)
 
 
-def _series(program: Program) -> dict[int, Series]:
+def _series(program: CompiledTable) -> dict[int, Series]:
     """Return the series of events by the counters of a program."""
     return {index: series for series, index in program.counters.series() if series.metric in EVENTS}

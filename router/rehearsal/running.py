@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Wire, framed
 from router.errors import Code, Diagnostic, UsageError
 from router.rehearsal import cdr
@@ -49,7 +49,7 @@ def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) 
 
 
 def _run(
-    test: TableTest, program: Program, rehearsal: Rehearsal, comparison: Comparison, coverage: Coverage | None
+    test: TableTest, program: CompiledTable, rehearsal: Rehearsal, comparison: Comparison, coverage: Coverage | None
 ) -> Result:
     result = Result(test)
     rehearsal.restart()
@@ -68,7 +68,7 @@ def _run(
     return result
 
 
-def _run_step(step: Step, rehearsal: Rehearsal, program: Program) -> Outcome:
+def _run_step(step: Step, rehearsal: Rehearsal, program: CompiledTable) -> Outcome:
     rehearsal.events.clear()
     begin = rehearsal.now if step.at is None else START + step.at
     rehearsal.advance(begin)

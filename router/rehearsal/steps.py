@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from router.compiler import Checked
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
-from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields
@@ -116,7 +116,7 @@ _PORT = 40_000
 class Names:
     """The names of a table. Methods take a name and its place, and raise InvalidValueError for an unknown name."""
 
-    def __init__(self, checked: Checked, program: Program) -> None:
+    def __init__(self, checked: Checked, program: CompiledTable) -> None:
         self._checked = checked
         self._program = program
         self._table = program.table

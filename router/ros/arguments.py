@@ -13,7 +13,7 @@ from typing import NamedTuple
 import yaml
 
 from router import inputs
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.topics import resolved
 from router.errors import ConfigurationError, nearest
 from router.table.model.settings import NodeSettings
@@ -67,7 +67,9 @@ class Variables(ChainMap[str, str]):
         return super().get(name, default)
 
 
-def without_effect(ros_args: Sequence[str], program: Program, names_read: Collection[str]) -> Iterator[tuple[str, str]]:
+def without_effect(
+    ros_args: Sequence[str], program: CompiledTable, names_read: Collection[str]
+) -> Iterator[tuple[str, str]]:
     """Yield each argument that has no effect, with a remedy. `names_read` are the names of the table's variables.
 
     Parameters for another node are skipped.
@@ -107,7 +109,7 @@ def _for_rule(match: str, topics: Mapping[str, str], node: NodeSettings) -> str:
     return f"did you mean '{near}'?" if near else "no topic of the table has this name"
 
 
-def _topics(program: Program, node: NodeSettings) -> dict[str, str]:
+def _topics(program: CompiledTable, node: NodeSettings) -> dict[str, str]:
     """Return the topics as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [entry.topic.topic.value for gateway in program.gateways for entry in gateway.settings.inbound]

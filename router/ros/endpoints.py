@@ -16,7 +16,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from router.clock import monotonic_ns
-from router.compiler.program import TopicPlan
+from router.compiler.compiled_table import TopicPlan
 from router.errors import ConfigurationError, SourceSpan
 from router.log import logger
 from router.ros.events import PeerEvents, WantedFlag

@@ -15,8 +15,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_policy_name_from_kind
 
+from router.compiler.compiled_table import TopicPlan
 from router.compiler.metrics import QOS_POLICIES
-from router.compiler.program import TopicPlan
 from router.log import fault, logger
 from router.ros.qos import ActualQos, incompatible_policies
 from router.threads import Thread, join_or_abandon

@@ -12,8 +12,8 @@ from typing import NamedTuple
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
+from router.compiler.compiled_table import CompiledTable, TopicPlan
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER, only
-from router.compiler.program import Program, TopicPlan
 from router.compiler.topics import resolved
 from router.log import logger
 from router.ros.marks import Router, marks, this_router
@@ -56,7 +56,7 @@ class Ours:
     published: Mapping[str, TopicPlan]
 
     @classmethod
-    def of(cls, program: Program) -> Ours:
+    def of(cls, program: CompiledTable) -> Ours:
         """Return what a program opens, without remaps."""
         settings = program.table.node
         received, published = (
@@ -104,7 +104,7 @@ def look(node: Node, ours: Ours) -> Surroundings:
     return Surroundings(dict(mistyped), shared, max(0, nodes.count(ours.node) - known))
 
 
-def look_once(tool: str, program: Program, seconds: float) -> Surroundings:
+def look_once(tool: str, program: CompiledTable, seconds: float) -> Surroundings:
     """Query the graph with a node of this name, `seconds` after opening it. Raises StartError."""
     node = open_node(tool)
     try:

@@ -15,7 +15,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 
-from router.compiler.program import QosPlan
+from router.compiler.compiled_table import QosPlan
 from router.ros.rcl import RCL
 
 

@@ -8,7 +8,7 @@ from functools import partial
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from router.compiler.program import TopicPlan
+from router.compiler.compiled_table import TopicPlan
 from router.errors import SourceSpan
 from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
 from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag

@@ -10,7 +10,7 @@ from typing import Any
 
 from google.protobuf.message import Message
 
-from router.compiler.program import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan
 from router.datagrams import Decoded, Wire
 from router.errors import DecodeError, UsageError, did_you_mean
 from router.table.model import RouteTable

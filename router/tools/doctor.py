@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 
 from router.compiler import Checked, check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import Severity, TransportError, plural, shown_path
 from router.observe.problems import Level
 from router.table import summary
@@ -103,7 +103,7 @@ def _table(checked: Checked) -> Iterator[CheckResult]:
     yield fine("table", f"{shown_path(checked.path)}: {summary(table)}")
 
 
-def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
+def _running(program: CompiledTable, running: Health | None) -> Iterator[CheckResult]:
     if program.table.http is None:
         yield warning(
             "router",
@@ -117,7 +117,7 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
         yield from _reported(program, running)
 
 
-def _reported(program: Program, running: Health) -> Iterator[CheckResult]:
+def _reported(program: CompiledTable, running: Health) -> Iterator[CheckResult]:
     """Yield what a running router reports; it may be running another version of the table."""
     if running.table_sha256 != program.table.sha256:
         yield warning("router", "its table differs from this file", "router reload, or systemctl restart")
@@ -137,7 +137,7 @@ def _in_place_of(running: Health | None) -> Mapping[str, str]:
     return {labels["endpoint"]: labels["sender"] for labels in reported if "sender" in labels}
 
 
-def _health(program: Program) -> Health | None:
+def _health(program: CompiledTable) -> Health | None:
     """Return the health of the running router; None if no router answers, or the table has no `http.address`."""
     try:
         return None if program.table.http is None else health(url_of(program.table))

@@ -18,8 +18,8 @@ from time import monotonic
 from typing import NamedTuple
 
 from router.assets import asset
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.extras import missing_extras, missing_modules
-from router.compiler.program import Program
 from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
@@ -71,7 +71,7 @@ _TIMEX_BYTES = 256
 _UNSYNCHRONISED = 0x40
 
 
-def receive_buffers(program: Program) -> Iterator[CheckResult]:
+def receive_buffers(program: CompiledTable) -> Iterator[CheckResult]:
     """Check that the kernel grants the receive buffers of the table."""
     if not program.listeners:
         return
@@ -97,7 +97,7 @@ LEAST_FREE = 64 << 20
 """Bytes: more than the recording of a stop takes at 5,000 datagrams per second."""
 
 
-def recordings(program: Program, *, running: bool) -> Iterator[CheckResult]:
+def recordings(program: CompiledTable, *, running: bool) -> Iterator[CheckResult]:
     """Check that the directory is writable and has room for what the table keeps.
 
     A `running` router may have another user, and reports itself what it cannot write.
@@ -217,7 +217,7 @@ _KEEPS = "systemd"
 """The process that holds the ports of an installed service."""
 
 
-def ports(program: Program, *, running: bool, with_listeners: bool = True) -> Iterator[CheckResult]:
+def ports(program: CompiledTable, *, running: bool, with_listeners: bool = True) -> Iterator[CheckResult]:
     """Check that the router can bind its ports, unless it is `running` already."""
     if running:
         yield fine("ports", "the running router has them")
@@ -233,7 +233,7 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
 
-def listeners(program: Program) -> Iterator[CheckResult]:
+def listeners(program: CompiledTable) -> Iterator[CheckResult]:
     """Check that the addresses of listeners, and the network interfaces that they name, are there and up."""
     for listener in program.listeners:
         about = f"listener '{listener.name}'"
@@ -248,7 +248,7 @@ def listeners(program: Program) -> Iterator[CheckResult]:
             yield warning("listeners", what, f"run `ip link set {listener.interface} up`")
 
 
-def ros_ports(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+def ros_ports(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     """Check that no listener or gateway has a UDP port that ROS uses."""
     uses_ros = bool(program.publishers or program.subscriptions or program.gateways)
     for clash in clashes(program, variables):
@@ -260,12 +260,12 @@ def _absence(listener: Listener) -> tuple[str, str] | None:
     return absence(listener.address.value._replace(port=0), listener.interface)  # even if the port is in use
 
 
-def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
+def _pages(program: CompiledTable) -> tuple[tuple[Located[Address] | None, str], ...]:
     servers = ("http", program.table.http), ("foxglove", program.table.foxglove)
     return tuple((server.address if server else None, f"{key}.address") for key, server in servers)
 
 
-def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
+def _gateways(program: CompiledTable) -> Iterator[tuple[str, Address, str]]:
     """Yield what gateways bind: (protocol, address, owner). Of Zenoh's locators, only TCP ones with an IPv4 address."""
     for gateway in program.table.gateways.values():
         what = f"gateway '{gateway.name}'"
@@ -315,7 +315,7 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
     )
 
 
-def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Iterator[CheckResult]:
+def ways(program: CompiledTable, grade: Callable[[str, str, str], CheckResult]) -> Iterator[CheckResult]:
     """Check that an IP route leads to each endpoint. `grade` makes the result if none does."""
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
@@ -329,7 +329,7 @@ def ways(program: Program, grade: Callable[[str, str, str], CheckResult]) -> Ite
             yield grade("endpoints", f"{endpoint.name}: nothing can be sent to {address.host}: {why}", remedy)
 
 
-def endpoints(program: Program, in_place_of: Mapping[str, str]) -> Iterator[CheckResult]:
+def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterator[CheckResult]:
     """Check that an IP route leads to each endpoint, and that it answers a ping.
 
     `in_place_of`: by endpoint, another host that sends its payloads.
@@ -397,12 +397,12 @@ def _request(identity: int) -> bytes:
     return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
 
 
-def extras(program: Program) -> Iterator[CheckResult]:
+def extras(program: CompiledTable) -> Iterator[CheckResult]:
     for missing in missing_extras(program.table):
         yield problem("Python", missing.what, missing.hint)
 
 
-def ros(program: Program) -> Iterator[CheckResult]:
+def ros(program: CompiledTable) -> Iterator[CheckResult]:
     plans = (*program.publishers, *program.subscriptions)
     if not plans and not program.gateways:
         return
@@ -438,7 +438,7 @@ DISCOVERY_S = 2.0
 """Seconds for the discovery of nodes, which rarely takes longer."""
 
 
-def ros_peers(program: Program) -> Iterator[CheckResult]:
+def ros_peers(program: CompiledTable) -> Iterator[CheckResult]:
     """Warn of what a router would meet in the ROS domain: another router, and peers of another type."""
     if not (program.publishers or program.subscriptions or program.gateways):
         return
@@ -506,7 +506,7 @@ def page(name: str) -> str:
     return f"{shown_path(asset(path))}{mark}{section}"
 
 
-def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+def open_domain(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     """Warn if the ROS domain is open to the networks of this computer."""
     if not (program.publishers or program.subscriptions or program.gateways):
         return

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, Target
+from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.program import GatewayPlan, InboundPlan, Program
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
@@ -86,7 +86,9 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
             yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
 
 
-def tried_route(checked: CheckedRoute, everything: Checked, program: Program, words: Sequence[str]) -> Iterator[str]:
+def tried_route(
+    checked: CheckedRoute, everything: Checked, program: CompiledTable, words: Sequence[str]
+) -> Iterator[str]:
     """Yield what happens to a payload of `field=value` words, sent by the first source to a newly started router.
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
@@ -392,7 +394,7 @@ def known_topics(table: RouteTable) -> Topics:
     return {resolved(topic.topic.value, table.node): topic.type_name for topic in topics}
 
 
-def seen_topics(program: Program, seconds: float) -> tuple[Topics, Sequence[Mistyped]]:
+def seen_topics(program: CompiledTable, seconds: float) -> tuple[Topics, Sequence[Mistyped]]:
     """Return the known topics with all that a node discovers in `seconds`, and the peers of another type.
 
     Raises StartError.

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from enum import Enum
 
 from router.compiler.checked import CheckedRoute, Target
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.expressions import tree
 from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements
 from router.compiler.lowering.layout import Layout, ReadOperation, WantedField
 from router.compiler.lowering.operations import Operation, Routine
-from router.compiler.program import Program
 from router.declared import NONE, Compared, Op, ReadKind, Relation, Scalar, Sign
 from router.errors import plural
 
@@ -24,7 +24,7 @@ _MOST_SHOWN = 16
 """Bytes of a literal that are shown."""
 
 
-def listed_route(checked: CheckedRoute, program: Program) -> Iterator[str]:
+def listed_route(checked: CheckedRoute, program: CompiledTable) -> Iterator[str]:
     """Yield all routines of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name

@@ -16,7 +16,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from router.compiler.program import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan
 from router.datagrams import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address

@@ -17,7 +17,7 @@ import pytest
 
 from router.app import Router
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from tests.ports import free_port
 from tests.repeating import repeating
 from tests.tables import PROTOS
@@ -75,7 +75,7 @@ class Site:
         let_rest(path)
         return path
 
-    def program(self, routes: str, endpoints: str = "") -> Program:
+    def program(self, routes: str, endpoints: str = "") -> CompiledTable:
         checked = check_table(self.write(routes, endpoints=endpoints))
         assert checked.program, "\n".join(map(str, checked.diagnostics))
         return checked.program

@@ -26,8 +26,8 @@ from router.app.counts import ThreadCounts
 from router.app.plane import Plane
 from router.app.watching import watched_files
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Counters
-from router.compiler.program import Program
 from router.observe.http import HttpServer
 from router.observe.snapshot import Snapshot, parse_metrics, snapshot
 from tests.acceptance.site import wait_until
@@ -554,7 +554,7 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
 
 
 def adoption_of(counters: Counters) -> Change:
-    return Change(cast("Program", SimpleNamespace(counters=counters)), None, is_first=False)
+    return Change(cast("CompiledTable", SimpleNamespace(counters=counters)), None, is_first=False)
 
 
 def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:

@@ -6,9 +6,9 @@ import ctypes
 from pathlib import Path
 
 from router.carrier.build import build, is_current
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import REJECT_REASONS
-from router.compiler.program import Program
 from router.declared import MAX_DATAGRAM, Envelope
 from router.image.wire_schema import write_schema
 from router.library import load
@@ -45,7 +45,7 @@ def native_library() -> ctypes.CDLL:
     return load()
 
 
-def table(schema: str, folder: Path) -> Program:
+def table(schema: str, folder: Path) -> CompiledTable:
     """A table for one of SCHEMAS, written to a new folder in `folder`, because the oracle reads the file again."""
     protos, cases = SCHEMAS[schema]
     routes = "".join(f"  {case}: {{source: any, destinations: [tool]}}\n" for case in cases)
@@ -57,7 +57,7 @@ def table(schema: str, folder: Path) -> Program:
 class CarrierSide:
     """`envelope_read` in the carrier's library."""
 
-    def __init__(self, library: ctypes.CDLL, made: Program) -> None:
+    def __init__(self, library: ctypes.CDLL, made: CompiledTable) -> None:
         self._memory = Arrays()
         self._schema = write_schema(made.envelope, made.inbound, self._memory)
         self._read = library.envelope_read

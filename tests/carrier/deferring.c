@@ -19,7 +19,7 @@ struct noted {
 
 /* One thread that offers, a group of timers, and their targets. Counters of target N begin at N * COUNTERS. */
 struct deferring {
-    struct stage offering, sending;
+    struct thread_env offering, sending;
     struct timers *timers;
     counter counters[MOST_TARGETS * COUNTERS];
     struct topic topic;
@@ -60,10 +60,10 @@ int64_t seam_next_due(struct deferring *of);
 int64_t seam_count(struct deferring *of, uint32_t number, uint32_t which);
 size_t seam_taken(struct deferring *of, const void **notes);
 
-static struct deferring *opened; /* for functions of the stages, which are one after the other */
+static struct deferring *opened; /* for functions of the envs, which are one after the other */
 
-static int64_t now_of(struct stage *stage) {
-    (void)stage;
+static int64_t now_of(struct thread_env *env) {
+    (void)env;
     return opened->now;
 }
 
@@ -78,8 +78,8 @@ static int note(const struct target *target, const uint8_t *data, size_t size) {
     return 0;
 }
 
-static int send_noted(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
-    (void)stage;
+static int send_noted(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    (void)env;
     return opened->now > expires ? COMMAND_STALE : note(target, data, size);
 }
 
@@ -91,27 +91,27 @@ static void give_up(void) {
     }
 }
 
-static enum publication publish_noted(struct stage *stage, const struct target *target, const char **why) {
+static enum publication publish_noted(struct thread_env *env, const struct target *target, const char **why) {
     *why = "refused";
     if (opened->is_given_up) {
         give_up();
         return ABANDONED;
     }
-    return note(target, stage->machine.output.data, stage->machine.output.size) ? PUBLISH_FAILED : PUBLISHED;
+    return note(target, env->machine.output.data, env->machine.output.size) ? PUBLISH_FAILED : PUBLISHED;
 }
 
-static void open_stage(struct deferring *of, struct stage *stage) {
-    if (!stage_open(stage, of->counters, ring_open(1 << 12), NULL)) abort();
-    stage->now = now_of;
-    stage->send = send_noted;
-    stage->publish = publish_noted;
+static void open_env(struct deferring *of, struct thread_env *env) {
+    if (!env_open(env, of->counters, ring_open(1 << 12), NULL)) abort();
+    env->now = now_of;
+    env->send = send_noted;
+    env->publish = publish_noted;
 }
 
 struct deferring *seam_open(void) {
     struct deferring *made = calloc(1, sizeof *made);
     if (!made) abort();
-    open_stage(made, &made->offering);
-    open_stage(made, &made->sending);
+    open_env(made, &made->offering);
+    open_env(made, &made->sending);
     made->timers = timers_open_on(&made->sending, false);
     if (!made->timers) abort();
     made->offering.timers = made->sending.timers = made->timers;
@@ -124,8 +124,8 @@ void seam_close(struct deferring *of) {
     timers_close(of->timers);
     ring_close(of->offering.reporter.events);
     ring_close(of->sending.reporter.events);
-    stage_close(&of->offering);
-    stage_close(&of->sending);
+    env_close(&of->offering);
+    env_close(&of->sending);
     free(of->notes.data);
     free(of);
 }
@@ -177,10 +177,10 @@ void seam_offer(struct deferring *of, uint32_t number, const void *data, size_t 
 
 /* What a machine has written: that of the thread which publishes, for a topic. */
 void seam_offer_written(struct deferring *of, uint32_t number, const void *data, size_t size, int64_t expires, int64_t now) {
-    struct stage *stage = of->targets[number].topic ? &of->sending : &of->offering;
-    stage->machine.output.size = 0;
-    if (!append(&stage->machine.output, data, size)) abort();
-    if (!defer(stage, of->deferrals[number], stage->machine.output.data, size, expires, now)) abort();
+    struct thread_env *env = of->targets[number].topic ? &of->sending : &of->offering;
+    env->machine.output.size = 0;
+    if (!append(&env->machine.output, data, size)) abort();
+    if (!defer(env, of->deferrals[number], env->machine.output.data, size, expires, now)) abort();
 }
 
 /* What has left since the last call. */

@@ -17,7 +17,7 @@ struct noted {
 
 /* What it has delivered since the last call. */
 struct delivering {
-    struct ros_routing routing; /* first, as its stage is */
+    struct ros_routing routing; /* first, as its env is */
     struct output notes, bytes, losses;
     int64_t now;
 };
@@ -34,24 +34,24 @@ size_t seam_losses(struct delivering *of, const void **events);
 size_t seam_from_ros(struct delivering *of, const struct ros_route *route, const void *data, size_t size,
                      int64_t received_at, const void **notes);
 
-static int64_t now_of(struct stage *stage) { return ((struct delivering *)stage)->now; }
+static int64_t now_of(struct thread_env *env) { return ((struct delivering *)env)->now; }
 
-static int note_sent(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
-    struct delivering *of = (struct delivering *)stage;
+static int note_sent(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    struct delivering *of = (struct delivering *)env;
     (void)target, (void)expires;
     of->bytes.size = 0;
     return !append(&of->bytes, data, size);
 }
 
-static enum publication note_published(struct stage *stage, const struct target *target, const char **why) {
-    struct output *written = &stage->machine.output;
+static enum publication note_published(struct thread_env *env, const struct target *target, const char **why) {
+    struct output *written = &env->machine.output;
     *why = "";
-    return note_sent(stage, target, written->data, written->size, NEVER) ? PUBLISH_FAILED : PUBLISHED;
+    return note_sent(env, target, written->data, written->size, NEVER) ? PUBLISH_FAILED : PUBLISHED;
 }
 
 /* Counters of targets: which of them has counted says what became of a message. */
 static int32_t outcome_of(const struct delivering *of, const struct target *target, const int64_t *before) {
-    const counter *counters = of->routing.stage.counters;
+    const counter *counters = of->routing.env.counters;
     if (counters[target->delivered] != before[0]) return DELIVERED;
     if (counters[target->filtered] != before[1]) return FILTERED_OUT;
     for (int32_t reason = 0; reason < DROP_REASONS; reason++)
@@ -59,16 +59,16 @@ static int32_t outcome_of(const struct delivering *of, const struct target *targ
     abort();
 }
 
-static bool note(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
-    struct delivering *of = (struct delivering *)stage;
-    counter *counters = stage->counters;
+static bool note(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
+    struct delivering *of = (struct delivering *)env;
+    counter *counters = env->counters;
     int64_t before[2 + DROP_REASONS] = {counters[target->delivered], counters[target->filtered]};
     for (int reason = 0; reason < DROP_REASONS; reason++) before[2 + reason] = counters[target->dropped[reason]];
     struct { struct lost_event event; char text[256]; } lost = {0};
-    stage->reporter.left = 1;
+    env->reporter.left = 1;
     of->bytes.size = 0;
-    bool goes_on = deliver(stage, to, target, message);
-    ring_take(stage->reporter.events, &lost, sizeof lost, 0);
+    bool goes_on = deliver(env, to, target, message);
+    ring_take(env->reporter.events, &lost, sizeof lost, 0);
     struct noted noted = {.target = (uint32_t)(target - to->targets), .outcome = outcome_of(of, target, before),
                           .place = lost.event.place, .length = (uint32_t)of->bytes.size};
     noted.size = (uint32_t)(sizeof noted + (of->bytes.size + 7) / 8 * 8);
@@ -79,28 +79,28 @@ static bool note(struct stage *stage, const struct targets *to, const struct tar
     return goes_on;
 }
 
-bool note_all(struct stage *stage, const struct targets *to, struct message *message) {
+bool note_all(struct thread_env *env, const struct targets *to, struct message *message) {
     for (uint32_t index = 0; index < to->count; index++)
-        if (!note(stage, to, &to->targets[index], message)) return false;
+        if (!note(env, to, &to->targets[index], message)) return false;
     return true;
 }
 
 struct delivering *seam_open(counter *counters) {
     struct delivering *made = calloc(1, sizeof *made);
     if (!made) return NULL;
-    struct stage *stage = &made->routing.stage;
-    struct timers *timers = timers_open_on(stage, false);
-    if (!timers || !stage_open(stage, counters, ring_open(1 << 16), timers)) abort();
-    stage->now = now_of;
-    stage->send = note_sent;
-    stage->publish = note_published;
+    struct thread_env *env = &made->routing.env;
+    struct timers *timers = timers_open_on(env, false);
+    if (!timers || !env_open(env, counters, ring_open(1 << 16), timers)) abort();
+    env->now = now_of;
+    env->send = note_sent;
+    env->publish = note_published;
     return made;
 }
 
 void seam_close(struct delivering *of) {
-    ring_close(of->routing.stage.reporter.events);
-    timers_close(of->routing.stage.timers);
-    stage_close(&of->routing.stage);
+    ring_close(of->routing.env.reporter.events);
+    timers_close(of->routing.env.timers);
+    env_close(&of->routing.env);
     free(of->notes.data);
     free(of->bytes.data);
     free(of->losses.data);
@@ -123,7 +123,7 @@ size_t seam_datagram(struct delivering *of, const struct targets *to, const void
                                 .column = column, .received_at = received_at};
     struct message message = {.datagram = &datagram};
     of->notes.size = 0;
-    note_all(&of->routing.stage, to, &message);
+    note_all(&of->routing.env, to, &message);
     free(copy);
     *notes = of->notes.data;
     return of->notes.size;
@@ -132,9 +132,9 @@ size_t seam_datagram(struct delivering *of, const struct targets *to, const void
 /* Keep what was reported, in which frames and datagrams were lost before they were delivered. */
 static void keep_losses(struct delivering *of) {
     uint64_t records[512];
-    for (size_t size; (size = ring_take(of->routing.stage.reporter.events, records, sizeof records, 0));)
+    for (size_t size; (size = ring_take(of->routing.env.reporter.events, records, sizeof records, 0));)
         if (!append(&of->losses, records, size)) abort();
-    of->routing.stage.reporter.window_began = INT64_MIN / 2; /* report all */
+    of->routing.env.reporter.window_began = INT64_MIN / 2; /* report all */
 }
 
 /* The events since the last call. */
@@ -154,26 +154,26 @@ size_t seam_part(struct delivering *of, const struct targets *to, const void *da
     struct message message = {.datagram = &datagram, .now = now, .times = {now, now}};
     of->now = now;
     of->notes.size = 0;
-    bool is_complete = collect(&of->routing.stage, to, &message);
+    bool is_complete = collect(&of->routing.env, to, &message);
     free(copy); /* what is kept is copied */
     datagram.data = NULL;
     keep_losses(of);
-    if (is_complete) note_all(&of->routing.stage, to, &message);
+    if (is_complete) note_all(&of->routing.env, to, &message);
     *notes = of->notes.data;
     return of->notes.size;
 }
 
 void seam_adopt(struct delivering *of, const struct timer_change *change) {
-    timers_change(of->routing.stage.timers, change);
+    timers_change(of->routing.env.timers, change);
     keep_losses(of);
 }
 
 /* Serve the timers that are due, and return when the next one is. */
 int64_t seam_serve(struct delivering *of, int64_t now) {
     of->now = now;
-    timers_serve(of->routing.stage.timers, now);
+    timers_serve(of->routing.env.timers, now);
     keep_losses(of);
-    return earliest(of->routing.stage.timers);
+    return earliest(of->routing.env.timers);
 }
 
 /* Serve a message from ROS, likewise. */

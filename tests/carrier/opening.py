@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from router.carrier.deadmen import NativeDeadman, open_deadman
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan
 from router.image.names import Names
 from router.image.openings import deadman_arguments
 

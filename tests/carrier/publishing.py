@@ -17,7 +17,7 @@ from router.carrier.forwarding_threads import ForwardingThreads
 from router.carrier.loading import LoadedImage
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.image.names import Names
 from router.image.writer import write_image
 from tests.small_tables import Ledger
@@ -65,7 +65,12 @@ class Publishing:
     """
 
     def __init__(
-        self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack, queue: int = 1 << 16
+        self,
+        library: ctypes.CDLL,
+        functions: ctypes.CDLL,
+        program: CompiledTable,
+        stack: ExitStack,
+        queue: int = 1 << 16,
     ) -> None:
         self.program = program
         self._library = library
@@ -95,7 +100,7 @@ class Publishing:
             self.sent += 1
             wait_until(lambda: self.ledger().total("datagrams_received") == self.sent)
 
-    def change(self, generation: int, program: Program | None = None) -> None:
+    def change(self, generation: int, program: CompiledTable | None = None) -> None:
         """Receive with another program from now on; the publish thread follows."""
         self._programs.append(self._made(program or self.program, generation))
         self._change_topics()
@@ -141,7 +146,7 @@ class Publishing:
         """The topic whose publisher blocks the thread, and for how many seconds; else None."""
         return self.thread.stalled()
 
-    def _made(self, program: Program, generation: int) -> LoadedImage:
+    def _made(self, program: CompiledTable, generation: int) -> LoadedImage:
         before = self._programs[-1] if generation > 1 else None
         image = write_image(program, self._names)
         loaded = LoadedImage(self._library, image, {}, self._deadmen.address, generation, before)

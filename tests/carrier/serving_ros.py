@@ -19,7 +19,7 @@ from router.carrier.from_ros import FromRosThread
 from router.carrier.loading import LoadedImage
 from router.carrier.ring import Ring
 from router.carrier.ros_routes import RosRoutes
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.image.names import Names
 from router.image.writer import write_image
 from tests.small_tables import Ledger
@@ -124,7 +124,7 @@ class Board:
 class ServingRos:
     """The thread for messages from ROS. It starts to serve at `serve`."""
 
-    def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack) -> None:
+    def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, program: CompiledTable, stack: ExitStack) -> None:
         self.program = program
         self.library = library
         self.counters = (c_int64 * MOST_COUNTERS)()

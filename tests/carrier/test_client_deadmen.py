@@ -17,8 +17,8 @@ from router.carrier.client_deadmen import ClientDeadmen
 from router.carrier.deadmen import NativeDeadman
 from router.carrier.ring import Ring
 from router.clock import boottime_ns
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan
 from router.image.names import Names
 from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.opening import opened_deadman

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from router.compiler import Checked, check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.rehearsal.cdr import deserialize
 from router.types.model import MessageType
 from tests.carrier.delivering import Delivering, Outcome, Payload
@@ -69,7 +69,7 @@ def checked() -> Checked:
     return made
 
 
-def program() -> Program:
+def program() -> CompiledTable:
     made = checked().program
     assert made is not None
     return made

@@ -29,8 +29,8 @@ from router.carrier.deadmen import Deadmen, NativeDeadman, successors
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.clock import boottime_ns
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import Counters
-from router.compiler.program import DeadmanPlan
 from router.image.names import Names
 from router.image.openings import feed_of
 from tests.carrier.building import MEMORY, RACES, run_program

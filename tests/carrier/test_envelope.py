@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.declared import MAX_DATAGRAM
 from router.errors import Code
 from router.types.wire import read_varint
@@ -23,7 +23,7 @@ from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint
 from tests.oracles.envelopes import Decision, decide
 from tests.small_tables import program
 
-Sides = tuple[Program, CarrierSide]
+Sides = tuple[CompiledTable, CarrierSide]
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from router.carrier.loading import LoadedImage
 from router.carrier.ring import Ring
 from router.carrier.ros_routes import RosRoutes
 from router.carrier.sender import NativeSender
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.image.writer import write_image
 from router.net.udp import open_sending
 from router.ros.node import close_node, open_node
@@ -58,7 +58,7 @@ TYPE = "comms/msg/DrivingBoardMotorMessage"
 class Router:
     """The thread between a node of ours and a board."""
 
-    program: Program
+    program: CompiledTable
     library: ctypes.CDLL
     thread: FromRosThread
     deadmen: Deadmen

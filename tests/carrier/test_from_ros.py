@@ -19,7 +19,7 @@ from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
 from tests.carrier.building import MEMORY, RACES, clocked_library, run_program
 from tests.carrier.serving_ros import ServingRos, Subscription, middleware
-from tests.carrier.staged import START, Staged
+from tests.carrier.simulated import START, Simulated
 from tests.small_tables import program
 
 ROUTES = """\
@@ -132,20 +132,20 @@ def of(datagram: bytes) -> float:
     return distance
 
 
-# ---- beside the stage
+# ---- beside the simulation
 
 Messages = Mapping[str, list[tuple[Callable[[int], bytes], int]]]
 """By topic: messages made with the wall clock, and how long ago (ns) they were sent."""
 
 
 def compare(serving: ServingRos, messages: Messages) -> None:
-    """The threads count and send what the stage does."""
-    staged = Staged(serving.program)
+    """The threads count and send what the simulation does."""
+    staged = Simulated(serving.program)
     for topic, sent in messages.items():
         for make, age in sent:
             now = wall_ns()
             serving.subscriptions[topic].put(make(now), now - age)
-            staged.stage.message(topic, make(START), START - age)
+            staged.simulation.message(topic, make(START), START - age)
             last = staged.ledger().total("messages_received")
         wait_until(lambda: serving.ledger().total("messages_received") == last)  # noqa: B023 - at once
     counted = ("messages_", "datagrams_", "sent_")

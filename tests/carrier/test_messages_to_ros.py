@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions, nested_types
-from router.compiler.program import Program
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model.expressions import FieldMap
@@ -69,7 +69,7 @@ def test_topics_of_tables_get_what_the_oracle_makes(library: CDLL, delivering: C
         _assert_allowed(delivering, reading, checked.program, route)
 
 
-def _assert_allowed(library: CDLL, reading: CarrierSide, program: Program, route: CheckedRoute) -> None:
+def _assert_allowed(library: CDLL, reading: CarrierSide, program: CompiledTable, route: CheckedRoute) -> None:
     lowered, case, envelope = program.lowered.to_topics[route.route.name], route.case, program.envelope
     topics = [target for target in route.targets if target.topic]
     assert lowered.targets.keys() == {topic.label for topic in topics}

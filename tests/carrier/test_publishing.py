@@ -15,7 +15,7 @@ import pytest
 from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.publishing import Publishing, wait_until
 from tests.carrier.serving_ros import middleware
-from tests.carrier.staged import START, Staged
+from tests.carrier.simulated import START, Simulated
 from tests.small_tables import STRANGER, enveloped, program
 
 _FLOAT = "type: std_msgs/msg/Float32, fields: {data: "
@@ -82,10 +82,10 @@ def check_books(publishing: Publishing) -> None:
 
 
 def compare(publishing: Publishing, *datagrams: bytes, listener: str = "exact") -> None:
-    """The thread counts and publishes what the stage does, but for topics that have no subscriber."""
-    staged = Staged(publishing.program)
+    """The thread counts and publishes what the simulation does, but for topics that have no subscriber."""
+    staged = Simulated(publishing.program)
     for datagram in datagrams:
-        staged.stage.datagram(listener, STRANGER, datagram, START)
+        staged.simulation.datagram(listener, STRANGER, datagram, START)
     publishing.send(*datagrams, listener=listener)
     wait_until(lambda: not publishing.count("messages_waiting"))
     unwanted = {topic for topic, each in publishing.publishers.items() if not each.wanted[0]}

@@ -14,9 +14,9 @@ from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
 from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
-from router.carrier.rehearsal import Stage
+from router.carrier.simulation import Simulation
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report
-from router.compiler.program import Program
 from router.compiler.refusals import _WORDS
 from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
@@ -39,16 +39,16 @@ message PBEnvelope { oneof payload { Note note = 1; Note other = 2; } }
 """
 
 
-def told(program: Program, *, ahead: int = 0, do: Callable[[Stage], None]) -> list[Report]:
-    stage = Stage(library(), START)
-    stage.adopt(program)
-    stage.set_clock(ahead)
-    do(stage)
-    return [record.report for record in stage.records() if isinstance(record, CountedReport)]
+def told(program: CompiledTable, *, ahead: int = 0, do: Callable[[Simulation], None]) -> list[Report]:
+    simulation = Simulation(library(), START)
+    simulation.adopt(program)
+    simulation.set_clock(ahead)
+    do(simulation)
+    return [record.report for record in simulation.records() if isinstance(record, CountedReport)]
 
 
 @pytest.fixture
-def notes(tmp_path: Path) -> Callable[[str], Program]:
+def notes(tmp_path: Path) -> Callable[[str], CompiledTable]:
     """The program of a table with these routes, whose payloads are `Note`."""
     (tmp_path / "protos").mkdir()
     (tmp_path / "protos" / "notes.proto").write_text(PROTO)
@@ -88,13 +88,13 @@ TO_ROS: Mapping[str, tuple[str, str, dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", TO_ROS)
 def test_a_datagram_that_fills_no_topic_says_where_and_why(
-    name: str, notes: Callable[[str], Program], tmp_path: Path
+    name: str, notes: Callable[[str], CompiledTable], tmp_path: Path
 ) -> None:
     type_name, fields, values, said = TO_ROS[name]
     routes = f"  note: {{source: sensor_board, topics: [{{topic: made, type: {type_name}, fields: {fields}}}]}}\n"
     made = notes(routes)
     data = note(tmp_path, **values)
-    (report,) = told(made, do=lambda stage: stage.datagram("exact", SENSOR_BOARD, data, START))
+    (report,) = told(made, do=lambda simulation: simulation.datagram("exact", SENSOR_BOARD, data, START))
     assert report.reason == ("non_finite" if name == "no integer" else "mapping_error")
     place, _, rest = report.detail.removeprefix(f"{tmp_path}/").partition(": ")
     assert place.startswith("table.yaml:14:")
@@ -118,12 +118,12 @@ FROM_ROS: Mapping[str, tuple[str, str, bytes, str]] = {
 
 @pytest.mark.parametrize("name", FROM_ROS)
 def test_a_message_from_ros_that_fills_no_datagram_says_where_and_why(
-    name: str, notes: Callable[[str], Program], tmp_path: Path
+    name: str, notes: Callable[[str], CompiledTable], tmp_path: Path
 ) -> None:
     type_name, fields, given, said = FROM_ROS[name]
     source = f"{{topic: given, type: {type_name}}}"
     made = notes(f"  note: {{source: {source}, fields: {fields}, destinations: [basestation]}}\n")
-    (report,) = told(made, do=lambda stage: stage.message("given", HEADER + given, START))
+    (report,) = told(made, do=lambda simulation: simulation.message("given", HEADER + given, START))
     assert (report.place, report.target, report.reason) == ("note", "basestation", "mapping_error")
     assert report.detail.removeprefix(f"{tmp_path}/").partition(": ")[2] == said
 
@@ -153,14 +153,14 @@ GPS = enveloped(gps_info={"latitude": 1})
 
 
 def test_a_stale_message_says_what_its_age_counts_from(tmp_path: Path) -> None:
-    def happen(stage: Stage) -> None:
-        stage.message("twist", TWIST, START)
-        stage.message("drive_motor", HEADER + bytes(64), START - 1500 * MS)
-        stage.message("drive_motor", HEADER + bytes(64), START - 300 * SECOND)
-        stage.datagram("exact", SENSOR_BOARD, GPS, START - 301 * MS)
+    def happen(simulation: Simulation) -> None:
+        simulation.message("twist", TWIST, START)
+        simulation.message("drive_motor", HEADER + bytes(64), START - 1500 * MS)
+        simulation.message("drive_motor", HEADER + bytes(64), START - 300 * SECOND)
+        simulation.datagram("exact", SENSOR_BOARD, GPS, START - 301 * MS)
         for _ in range(2):
-            stage.datagram("exact", SENSOR_BOARD, GPS, START)
-        stage.advance(START + SECOND)
+            simulation.datagram("exact", SENSOR_BOARD, GPS, START)
+        simulation.advance(START + SECOND)
 
     clock = "the publisher's clock"
     reports = told(program(tmp_path, AGED), do=happen)
@@ -202,26 +202,26 @@ REQUIRING = b"\x0a\0"
 PART = {"frame_id": 1, "total_count": 2, "index": 0}
 
 
-def from_board(*datagrams: bytes, age: int = 0) -> Callable[[Stage], None]:
-    def happen(stage: Stage) -> None:
+def from_board(*datagrams: bytes, age: int = 0) -> Callable[[Simulation], None]:
+    def happen(simulation: Simulation) -> None:
         for each in datagrams:
-            stage.datagram("exact", SENSOR_BOARD, each, START - age)
-        stage.advance(START + 20 * SECOND)
+            simulation.datagram("exact", SENSOR_BOARD, each, START - age)
+        simulation.advance(START + 20 * SECOND)
 
     return happen
 
 
-def from_basestation(*datagrams: bytes) -> Callable[[Stage], None]:
-    def happen(stage: Stage) -> None:
+def from_basestation(*datagrams: bytes) -> Callable[[Simulation], None]:
+    def happen(simulation: Simulation) -> None:
         for each in datagrams:
-            stage.datagram("exact", BASESTATION, each, START)
-        stage.advance(START + 20 * SECOND)
+            simulation.datagram("exact", BASESTATION, each, START)
+        simulation.advance(START + 20 * SECOND)
 
     return happen
 
 
 IMU = enveloped(imu_info={"accel_x": 1, "accel_y": float("nan")})
-DROPPED: Mapping[str, Callable[[Stage], None]] = {
+DROPPED: Mapping[str, Callable[[Simulation], None]] = {
     "mapping_error": from_board(enveloped(imu_info={"accel_y": 1})),
     "non_finite": from_board(IMU),
     "too_large": from_basestation(LARGE),
@@ -233,15 +233,15 @@ DROPPED: Mapping[str, Callable[[Stage], None]] = {
     "missing_field": from_basestation(REQUIRING),
 }
 BRAKE, DRIVE = enveloped(manual_brake={"brake": True}), enveloped(manual_drive={"forward_backward": 5})
-REJECTED: Mapping[str, Callable[[Stage], None]] = {
+REJECTED: Mapping[str, Callable[[Simulation], None]] = {
     "truncated": from_board(bytes(1 << 15)),
     "empty": from_board(b""),
     "malformed": from_board(b"\x0a\x7f"),
-    "no_payload": lambda stage: stage.datagram("trimmed", SENSOR_BOARD, bytes(7), START),
+    "no_payload": lambda simulation: simulation.datagram("trimmed", SENSOR_BOARD, bytes(7), START),
     "unknown_case": from_board(b"\xea\x77\x00"),
     "unhandled": from_board(enveloped(arm_pos={})),
     "ignored": from_board(enveloped(pump_info={})),
-    "source_mismatch": lambda stage: stage.datagram("exact", STRANGER, GPS, START),
+    "source_mismatch": lambda simulation: simulation.datagram("exact", STRANGER, GPS, START),
 }
 SUPERSEDED: Mapping[str, tuple[bytes, int, str]] = {
     "before a routed one": (BRAKE + DRIVE, 1, "manual_brake, then manual_drive"),
@@ -324,15 +324,15 @@ def test_every_rejection_has_a_line_with_its_sender(reason: str, tmp_path: Path)
 def test_payloads_that_a_later_one_replaces_are_counted_and_told_with_their_sender(name: str, tmp_path: Path) -> None:
     data, count, payloads = SUPERSEDED[name]
     made = program(tmp_path, LOSING)
-    stage = Stage(library(), START)
-    stage.adopt(made)
-    stage.datagram("exact", BASESTATION, data, START)
-    reports = [record.report for record in stage.records() if isinstance(record, CountedReport)]
+    simulation = Simulation(library(), START)
+    simulation.adopt(made)
+    simulation.datagram("exact", BASESTATION, data, START)
+    reports = [record.report for record in simulation.records() if isinstance(record, CountedReport)]
     host, port = BASESTATION
     (line,) = logged([each for each in reports if each.kind == "supersede"])
     assert line["event"] == "datagram has several payloads; only the last one counts"
     assert (line["listener"], line["detail"]) == ("exact", f"from {host}:{port}: {payloads}")
-    assert stage.counters(made.counters.size)[made.counters.index("superseded_members", "exact")] == count
+    assert simulation.counters(made.counters.size)[made.counters.index("superseded_members", "exact")] == count
 
 
 @pytest.mark.parametrize(
@@ -346,5 +346,7 @@ def test_payloads_that_a_later_one_replaces_are_counted_and_told_with_their_send
     ],
 )
 def test_one_payload_supersedes_none(data: bytes, tmp_path: Path) -> None:
-    reports = told(program(tmp_path, LOSING), do=lambda stage: stage.datagram("exact", BASESTATION, data, START))
+    reports = told(
+        program(tmp_path, LOSING), do=lambda simulation: simulation.datagram("exact", BASESTATION, data, START)
+    )
     assert reports == []

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from router.carrier.events import Returned
-from router.carrier.rehearsal import Stage
-from router.compiler.program import Program
+from router.carrier.simulation import Simulation
+from router.compiler.compiled_table import CompiledTable
 from router.library import library
 from tests.small_tables import HEAD, MS, SECOND, SENSOR_BOARD, enveloped, program
 
@@ -19,26 +19,26 @@ PH = enveloped(ph_info={})
 class Heard:
     """One run, with the time in ms at which each endpoint sends."""
 
-    def __init__(self, compiled: Program) -> None:
+    def __init__(self, compiled: CompiledTable) -> None:
         self.compiled = compiled
-        self.stage = Stage(library(), 10**12)
-        self.stage.adopt(compiled)
+        self.simulation = Simulation(library(), 10**12)
+        self.simulation.adopt(compiled)
         self.returned: list[Returned] = []
         self.ahead = 0
 
     def hear(self, after: int, times: int = 1, sender: tuple[str, int] = SENSOR_BOARD) -> None:
         """Receive datagrams, each `after` this many ms."""
         for _ in range(times):
-            self.stage.advance(self.stage.now + after * MS)
-            self.stage.datagram("trimmed", sender, PH, self.stage.now + self.ahead)
-            self.returned += [each for each in self.stage.records() if isinstance(each, Returned)]
+            self.simulation.advance(self.simulation.now + after * MS)
+            self.simulation.datagram("trimmed", sender, PH, self.simulation.now + self.ahead)
+            self.returned += [each for each in self.simulation.records() if isinstance(each, Returned)]
 
     def set_clock(self, ahead: int) -> None:
         self.ahead = ahead
-        self.stage.set_clock(ahead)
+        self.simulation.set_clock(ahead)
 
     def count(self, metric: str) -> int:
-        counters = self.stage.counters(len(self.compiled.counters.fresh_counts()))
+        counters = self.simulation.counters(len(self.compiled.counters.fresh_counts()))
         return counters[self.compiled.counters.index(metric, "sensor_board")]
 
 
@@ -56,7 +56,7 @@ def test_a_board_that_is_reset_leaves_a_trace(heard: Heard) -> None:
     assert heard.returned == [Returned("sensor_board", 2.3), Returned("sensor_board", 2.6)]
     assert heard.count("endpoint_silences") == 2
     assert heard.count("endpoint_last_silence_seconds") == 2600 * MS
-    assert heard.count("endpoint_silence_seconds") == heard.count("endpoint_heard_seconds") == heard.stage.now
+    assert heard.count("endpoint_silence_seconds") == heard.count("endpoint_heard_seconds") == heard.simulation.now
 
 
 def test_short_pauses_and_slow_senders_have_no_silences(heard: Heard) -> None:
@@ -82,7 +82,7 @@ def test_a_clock_that_is_set_is_no_silence(heard: Heard) -> None:
     for ahead in (3600 * SECOND, 0, -3600 * SECOND):
         heard.set_clock(ahead)
         heard.hear(20, 300)
-        assert heard.count("endpoint_silence_seconds") == heard.stage.now
+        assert heard.count("endpoint_silence_seconds") == heard.simulation.now
     assert heard.returned == []
     heard.hear(2300)
     assert heard.returned == [Returned("sensor_board", 2.3)]

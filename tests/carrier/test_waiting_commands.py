@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from router.carrier.events import DeadmanChange
-from router.carrier.rehearsal import Output, Stage, Time
-from router.compiler.program import Program
+from router.carrier.simulation import Output, Simulation, Time
+from router.compiler.compiled_table import CompiledTable
 from tests.envelopes import LEN, framed, tag, varint
 from tests.small_tables import BASESTATION, BRAKE, HEAD, MS, SECOND, SENSOR_BOARD, Ledger, enveloped, program
 
@@ -40,15 +40,15 @@ HELD = f"""\
 """
 
 
-def table(folder: Path, routes: str, far: str = FAR) -> Program:
+def table(folder: Path, routes: str, far: str = FAR) -> CompiledTable:
     return program(folder, routes, HEAD.replace("routes:", far))
 
 
 class Rehearsing:
-    """A stage with its `outputs` by time and target, and the `changes` of its deadmen."""
+    """A simulation with its `outputs` by time and target, and the `changes` of its deadmen."""
 
-    def __init__(self, library: ctypes.CDLL, made: Program) -> None:
-        self._stage = Stage(library)
+    def __init__(self, library: ctypes.CDLL, made: CompiledTable) -> None:
+        self._stage = Simulation(library)
         self.outputs: list[tuple[int, str, bytes]] = []
         self.changes: list[tuple[str, bool]] = []
         self._at = 0
@@ -58,7 +58,7 @@ class Rehearsing:
     def now(self) -> int:
         return self._stage.now
 
-    def reload(self, made: Program) -> None:
+    def reload(self, made: CompiledTable) -> None:
         self.program = made
         self._stage.adopt(made)
         self._collect()
@@ -96,7 +96,7 @@ class Rehearsing:
         return {labels[3]: count for labels, count in found if labels[1:3] == (route, target)}
 
     def assert_counters_balance(self) -> None:
-        """But for the histogram: a stage measures no durations."""
+        """But for the histogram: a simulation measures no durations."""
         assert [found for found in self._ledger().imbalances() if "histogram" not in found] == []
 
     def _ledger(self) -> Ledger:
@@ -122,11 +122,11 @@ def large(paced: Rehearsing, case: str, size: int) -> bytes:
     return framed(number, tag(30, LEN) + varint(size) + bytes(size))
 
 
-def drives(stage: Rehearsing, ns: int) -> None:
+def drives(simulation: Rehearsing, ns: int) -> None:
     """20 commands per second, of the operator."""
     for _ in range(ns // (50 * MS)):
-        stage.receive(TURN, BASESTATION)
-        stage.pass_time(50 * MS)
+        simulation.receive(TURN, BASESTATION)
+        simulation.pass_time(50 * MS)
 
 
 # ---- deadmen
@@ -166,19 +166,19 @@ def test_commands_beside_more_bulk_than_the_budget_are_neither_late_nor_stale(pa
 
 def test_it_trips_when_all_commands_are_dropped(rehearse: Rehearse) -> None:
     """Another source's command takes the commands' part of the budget for almost three seconds."""
-    stage = rehearse(PACED.replace(", disarmed_by: [pump_info]", ""), FAR.replace("10kB/s", "5kB/s"))
-    drives(stage, SECOND)
-    stage.receive(large(stage, "pump_info", 16_000), SENSOR_BOARD)
-    drives(stage, 2 * SECOND)
+    simulation = rehearse(PACED.replace(", disarmed_by: [pump_info]", ""), FAR.replace("10kB/s", "5kB/s"))
+    drives(simulation, SECOND)
+    simulation.receive(large(simulation, "pump_info", 16_000), SENSOR_BOARD)
+    drives(simulation, 2 * SECOND)
 
-    assert stage.changes == [("manual_drive", True)]
-    assert stage.many(BRAKE) == 16
-    assert stage.dropped("manual_drive", "far_board")["stale"] >= 36
-    drives(stage, 2 * SECOND)
-    assert stage.changes == [("manual_drive", True), ("manual_drive", False)]
-    assert stage.sent[-1] == TURN
-    stage.pass_time(SECOND)
-    stage.assert_counters_balance()
+    assert simulation.changes == [("manual_drive", True)]
+    assert simulation.many(BRAKE) == 16
+    assert simulation.dropped("manual_drive", "far_board")["stale"] >= 36
+    drives(simulation, 2 * SECOND)
+    assert simulation.changes == [("manual_drive", True), ("manual_drive", False)]
+    assert simulation.sent[-1] == TURN
+    simulation.pass_time(SECOND)
+    simulation.assert_counters_balance()
 
 
 def test_one_that_takes_over_disarms_it_when_it_leaves_and_not_when_it_is_dropped(paced: Rehearsing) -> None:
@@ -200,45 +200,45 @@ def test_one_that_takes_over_disarms_it_when_it_leaves_and_not_when_it_is_droppe
 
 
 def test_what_is_held_back_for_a_rate_feeds_it_when_it_leaves(rehearse: Rehearse) -> None:
-    stage = rehearse(HELD)
-    stage.receive(TURN, BASESTATION)
-    stage.pass_time(100 * MS)
-    stage.receive(TURN, BASESTATION)  # held back until 167 ms
-    stage.pass_time(501 * MS)
-    assert stage.sent == [TURN, TURN]
-    assert stage.changes == []
-    stage.pass_time(67 * MS)
-    assert stage.changes == [("manual_drive", True)]
+    simulation = rehearse(HELD)
+    simulation.receive(TURN, BASESTATION)
+    simulation.pass_time(100 * MS)
+    simulation.receive(TURN, BASESTATION)  # held back until 167 ms
+    simulation.pass_time(501 * MS)
+    assert simulation.sent == [TURN, TURN]
+    assert simulation.changes == []
+    simulation.pass_time(67 * MS)
+    assert simulation.changes == [("manual_drive", True)]
 
 
 # ---- boards
 
 
 def test_what_a_board_cannot_take_does_not_replace_what_is_held(rehearse: Rehearse) -> None:
-    stage = rehearse(
+    simulation = rehearse(
         "  imu_info: {source: sensor_board, destinations: [{endpoint: far_board, max_rate: 1 Hz, on_limit: latest}]}\n",
         FAR.replace("tool", "board").replace(", bandwidth: 10kB/s", ""),
     )
     first, good, bad = (enveloped(imu_info={"accel_x": value}) for value in (1, 2, float("nan")))
     for datagram in (first, good, bad):
-        stage.receive(datagram, SENSOR_BOARD)
-    stage.pass_time(2 * SECOND)
-    assert stage.sent == [first, good]
-    assert stage.dropped("imu_info", "far_board") == {"non_finite": 1}
+        simulation.receive(datagram, SENSOR_BOARD)
+    simulation.pass_time(2 * SECOND)
+    assert simulation.sent == [first, good]
+    assert simulation.dropped("imu_info", "far_board") == {"non_finite": 1}
 
 
 def test_what_waits_for_a_bandwidth_has_lost_its_trailing_zeros(rehearse: Rehearse) -> None:
     """So it is charged as it is sent."""
-    stage = rehearse(
+    simulation = rehearse(
         "  ph_info: {source: sensor_board, destinations: [far_board]}\n",
         FAR.replace("10kB/s", "1kB/s, trim_trailing_zeros: true"),
     )
     datagrams = [framed(1, tag(30, LEN) + varint(size) + b"\1" + bytes(size - 1)) for size in (500, 501)]
-    number = large(stage, "ph_info", 0)[0]
+    number = large(simulation, "ph_info", 0)[0]
     for datagram in datagrams:
-        stage.receive(bytes([number]) + datagram[1:])
-    stage.end()
-    assert [len(data) < 20 for data in stage.sent] == [True, True]
+        simulation.receive(bytes([number]) + datagram[1:])
+    simulation.end()
+    assert [len(data) < 20 for data in simulation.sent] == [True, True]
 
 
 # ---- reloads
@@ -253,16 +253,16 @@ def numbered(number: int) -> bytes:
 
 
 def test_what_waits_for_a_bandwidth_goes_along_to_the_next_program(rehearse: Rehearse, tmp_path: Path) -> None:
-    stage = rehearse(PH, SLOW)
+    simulation = rehearse(PH, SLOW)
     for number in range(1, 101):
-        stage.receive(numbered(number))
-    before = len(stage.outputs)
+        simulation.receive(numbered(number))
+    before = len(simulation.outputs)
     for more in (OTHER, "", OTHER):
-        stage.reload(table(tmp_path, PH.replace("[far_board]}", "[far_board], priority: bulk}") + more, SLOW))
-    assert len(stage.outputs) == before < 100
-    stage.pass_time(10 * SECOND)
-    assert stage.sent == [numbered(number) for number in range(1, 101)]
-    stage.assert_counters_balance()
+        simulation.reload(table(tmp_path, PH.replace("[far_board]}", "[far_board], priority: bulk}") + more, SLOW))
+    assert len(simulation.outputs) == before < 100
+    simulation.pass_time(10 * SECOND)
+    assert simulation.sent == [numbered(number) for number in range(1, 101)]
+    simulation.assert_counters_balance()
 
 
 @pytest.mark.parametrize(
@@ -280,42 +280,42 @@ def test_what_waits_for_a_bandwidth_goes_along_to_the_next_program(rehearse: Reh
 def test_what_the_next_program_does_not_hold_leaves_before_its_own(
     rehearse: Rehearse, tmp_path: Path, routes: str, far: str
 ) -> None:
-    stage = rehearse(PH, SLOW)
+    simulation = rehearse(PH, SLOW)
     for number in range(1, 101):
-        stage.receive(numbered(number))
-    assert len(stage.outputs) < 100
+        simulation.receive(numbered(number))
+    assert len(simulation.outputs) < 100
     routes = routes.replace("far_board", "other_board") if "other_board" in far else routes
-    stage.reload(table(tmp_path, routes, far))
-    assert stage.sent == [numbered(number) for number in range(1, 101)]
-    stage.receive(numbered(101), BASESTATION if "basestation" in routes else SENSOR_BOARD)
-    stage.pass_time(SECOND)
-    assert stage.sent[:100] == [numbered(number) for number in range(1, 101)]
+    simulation.reload(table(tmp_path, routes, far))
+    assert simulation.sent == [numbered(number) for number in range(1, 101)]
+    simulation.receive(numbered(101), BASESTATION if "basestation" in routes else SENSOR_BOARD)
+    simulation.pass_time(SECOND)
+    assert simulation.sent[:100] == [numbered(number) for number in range(1, 101)]
 
 
 def test_a_command_that_is_held_in_a_reload_feeds_the_deadman_of_the_next_program(
     rehearse: Rehearse, tmp_path: Path
 ) -> None:
-    stage = rehearse(HELD)
-    stage.receive(TURN, BASESTATION)
-    stage.pass_time(100 * MS)
-    stage.receive(TURN, BASESTATION)  # held back until 167 ms
-    stage.reload(table(tmp_path, HELD.replace("500ms", "450ms")))
-    stage.pass_time(510 * MS)
-    assert stage.sent == [TURN, TURN]
-    assert stage.changes == []
-    stage.pass_time(10 * MS)
-    assert stage.changes == [("manual_drive", True)]
+    simulation = rehearse(HELD)
+    simulation.receive(TURN, BASESTATION)
+    simulation.pass_time(100 * MS)
+    simulation.receive(TURN, BASESTATION)  # held back until 167 ms
+    simulation.reload(table(tmp_path, HELD.replace("500ms", "450ms")))
+    simulation.pass_time(510 * MS)
+    assert simulation.sent == [TURN, TURN]
+    assert simulation.changes == []
+    simulation.pass_time(10 * MS)
+    assert simulation.changes == [("manual_drive", True)]
 
 
 def test_what_is_held_of_a_route_that_goes_leaves_before_the_last_brake(rehearse: Rehearse, tmp_path: Path) -> None:
-    stage = rehearse(HELD)
-    stage.receive(TURN, BASESTATION)
-    stage.pass_time(100 * MS)
-    stage.receive(TURN, BASESTATION)
-    stage.reload(table(tmp_path, OTHER, FAR))
-    assert stage.sent == [TURN, TURN, BRAKE]
-    stage.pass_time(SECOND)
-    assert Counter(stage.sent) == {TURN: 2, BRAKE: 1}
+    simulation = rehearse(HELD)
+    simulation.receive(TURN, BASESTATION)
+    simulation.pass_time(100 * MS)
+    simulation.receive(TURN, BASESTATION)
+    simulation.reload(table(tmp_path, OTHER, FAR))
+    assert simulation.sent == [TURN, TURN, BRAKE]
+    simulation.pass_time(SECOND)
+    assert Counter(simulation.sent) == {TURN: 2, BRAKE: 1}
 
 
 def test_at_the_stop_what_waits_leaves_before_the_last_brake(paced: Rehearsing) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from router.compiler import Checked, check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
 from tests.tables import PROTOS, ROUTES
 
 HEAD = """\
@@ -39,7 +39,7 @@ def rover(definitions: Definitions) -> Checked:
 
 
 @pytest.fixture(scope="session")
-def rover_program(rover: Checked) -> Program:
+def rover_program(rover: Checked) -> CompiledTable:
     assert rover.diagnostics == []
     assert rover.program is not None
     return rover.program

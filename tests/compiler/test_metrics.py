@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import (
     DROP_REASONS,
     HISTOGRAM_CELLS,
@@ -14,7 +15,6 @@ from router.compiler.metrics import (
     Series,
     metric,
 )
-from router.compiler.program import Program
 from router.errors import ConfigurationError
 
 
@@ -50,7 +50,7 @@ def test_metric_names_are_unique() -> None:
     assert [metric(one.name) for one in METRICS] == list(METRICS)
 
 
-def test_rover_has_every_series_before_the_first_datagram(rover_program: Program) -> None:
+def test_rover_has_every_series_before_the_first_datagram(rover_program: CompiledTable) -> None:
     series = dict(rover_program.counters.series())
     taken = [index + cell for each, index in series.items() for cell in range(_cells(each))]
     assert sorted(taken) == list(range(rover_program.counters.size))

@@ -14,8 +14,8 @@ from typing import Any, cast
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.metrics import Report
-from router.compiler.program import GatewayPlan, Program
 from router.errors import StartError
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters
@@ -43,7 +43,7 @@ gateways: {{{gateways}}}
 """
 
 
-def program(folder: Path, gateways: str) -> Program:
+def program(folder: Path, gateways: str) -> CompiledTable:
     """The program of a table with these gateways, a YAML flow mapping without its braces."""
     path = folder / "table.yaml"
     text = TABLE.format(protos=PROTOS, gateways=gateways)
@@ -159,7 +159,7 @@ class PlayedTransport:
 class Stage:
     """The gateways of a program, as one `Played` each, with shared topics: `async with Stage(program, graph)`."""
 
-    def __init__(self, made: Program, graph: Graph | RosTopics) -> None:
+    def __init__(self, made: CompiledTable, graph: Graph | RosTopics) -> None:
         self.faults: list[Exception] = []
         self.reports: list[Report] = []
         self.published: list[tuple[str, bytes]] = []

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rcl_interfaces.srv import GetParameters  # type: ignore[import-untyped]
 from rclpy.serialization import serialize_message
 
-from router.compiler.program import TopicPlan
+from router.compiler.compiled_table import TopicPlan
 from router.errors import StartError
 from router.gateway.encoding import ReadyType, Sample
 from router.gateway.json_codec import UnreadableError

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import StartError
 from router.gateway.thread import GatewayThread
 from router.gateway.transport.tcp import TcpTransport
@@ -22,7 +22,7 @@ from tests.gateway.stage import Graph, program
 from tests.ports import free_port
 
 
-def opened(made: Program) -> GatewayThread:
+def opened(made: CompiledTable) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
     thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter())
     try:

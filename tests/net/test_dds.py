@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from router.app import Router
 from router.cli import main
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import ConfigurationError
 from router.net.dds import clashes
 from router.net.kernel import BELOW_ROS, why_not_bound
@@ -42,7 +42,7 @@ def table(folder: Path, port: int, route: str = TO_ROS) -> Path:
     return path
 
 
-def compiled(path: Path) -> Program:
+def compiled(path: Path) -> CompiledTable:
     program = check_table(path).program
     assert program is not None
     return program

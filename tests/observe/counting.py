@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.observe.health import HealthSnapshot
 from router.observe.watch import Watch
 from tests.observe.fake_running import FakeRunning
@@ -31,7 +31,7 @@ gateways:
 class Counting(FakeRunning):
     """`now` is the boot clock in ns."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledTable) -> None:
         super().__init__(program)
         self.now = self.began = START
         self.sent = 0

@@ -14,8 +14,8 @@ from prometheus_client.metrics_core import Metric as Family
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Mismatch
-from router.compiler.program import Program
 from router.datagrams import Peer
 from router.errors import SourceSpan
 from router.net.doors import Door
@@ -42,7 +42,7 @@ _LATER = [0] * 100
 
 
 @cache
-def sim_program() -> Program:
+def sim_program() -> CompiledTable:
     """The program of routes/sim.yaml."""
     program = check_table(ROUTES / "sim.yaml").program
     assert program is not None
@@ -55,7 +55,7 @@ class FakeRunning:
     `began`: when it was started (boot clock, ns).
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledTable) -> None:
         self.program = program
         self.is_ready = True
         self.is_stuck = False

@@ -24,7 +24,7 @@ from websockets.typing import Subprotocol
 from websockets.uri import parse_uri
 
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import Located, SourceSpan, StartError
 from router.net import doors
 from router.net.doors import Door
@@ -46,7 +46,7 @@ REFUSED = Counter[str]()
 class Showing:
     """A router in so far as it shows what it receives. `attached` has who is shown it."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledTable) -> None:
         self.program = program
         self.mirror = self
         self.attached: list[Consumer] = []
@@ -82,19 +82,19 @@ def serve(router: Showing, address: Address = LOOPBACK, networks: Sequence[IPv4N
     return FoxgloveServer(settings, Door("foxglove", networks, REFUSED), cast("Running", router))
 
 
-def compiled(table: Path) -> Program:
+def compiled(table: Path) -> CompiledTable:
     checked = check_table(table)
     assert checked.program is not None, [*map(str, checked.diagnostics)]
     return checked.program
 
 
 @pytest.fixture(scope="module")
-def program() -> Program:
+def program() -> CompiledTable:
     return compiled(ROUTES / "rover.yaml")
 
 
 @pytest.fixture
-def router(program: Program) -> Showing:
+def router(program: CompiledTable) -> Showing:
     return Showing(program)
 
 
@@ -110,7 +110,7 @@ def client(server: FoxgloveServer) -> Iterator[FoxgloveClient]:
         yield opened
 
 
-def envelope(program: Program, case: str, **fields: object) -> bytes:
+def envelope(program: CompiledTable, case: str, **fields: object) -> bytes:
     payload = program.envelope.cases[case].message_class(**fields)
     return program.envelope.message_class(**{case: payload}).SerializeToString()
 
@@ -128,14 +128,14 @@ def show_until_received(router: Showing, client: FoxgloveClient, case: str) -> N
     raise AssertionError(f"no {case} was received")
 
 
-def test_there_is_a_channel_for_each_payload_case(program: Program, client: FoxgloveClient) -> None:
+def test_there_is_a_channel_for_each_payload_case(program: CompiledTable, client: FoxgloveClient) -> None:
     assert client.channels.keys() == program.envelope.cases.keys()
     assert client.info["name"] == "rover_router"
     assert client.info["capabilities"] == []  # a client can look, and nothing else
 
 
 def test_payloads_come_with_their_arrival_and_are_read_by_the_schema_alone(
-    program: Program, router: Showing, client: FoxgloveClient
+    program: CompiledTable, router: Showing, client: FoxgloveClient
 ) -> None:
     client.subscribe("imu_info")
     router.wait_for(1)
@@ -148,7 +148,7 @@ def test_payloads_come_with_their_arrival_and_are_read_by_the_schema_alone(
 
 
 def test_every_schema_is_whole_and_only_what_was_subscribed_to_is_sent(
-    program: Program, router: Showing, client: FoxgloveClient
+    program: CompiledTable, router: Showing, client: FoxgloveClient
 ) -> None:
     """Schemas of messages in other files are there as well."""
     client.subscribe(*(case for case in program.envelope.cases if case != "imu_info"))
@@ -175,7 +175,7 @@ def test_router_is_watched_only_while_somebody_has_subscribed(router: Showing, s
 
 
 def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
-    program: Program, router: Showing, client: FoxgloveClient
+    program: CompiledTable, router: Showing, client: FoxgloveClient
 ) -> None:
     client.subscribe("manual_brake")
     router.wait_for(1)
@@ -184,7 +184,7 @@ def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
     assert [client.receive().log_time for _ in range(2)] == [100, 104]
 
 
-def test_what_no_route_took_is_not_shown(program: Program, router: Showing, client: FoxgloveClient) -> None:
+def test_what_no_route_took_is_not_shown(program: CompiledTable, router: Showing, client: FoxgloveClient) -> None:
     client.subscribe("imu_info")
     router.wait_for(1)
     router.show(envelope(program, "imu_info", accel_x=66.0), at=100, reason="source_mismatch")
@@ -208,7 +208,7 @@ def test_listener_that_repairs_nothing_shows_nothing_that_it_rejects(tmp_path: P
 
 
 def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
-    tmp_path: Path, program: Program, router: Showing, client: FoxgloveClient
+    tmp_path: Path, program: CompiledTable, router: Showing, client: FoxgloveClient
 ) -> None:
     """The same protos elsewhere, in which one message has a field more."""
     protos = tmp_path / "protos"
@@ -243,7 +243,7 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
 
 
 def test_a_fault_is_told_once_and_does_not_end_the_view(
-    program: Program, router: Showing, client: FoxgloveClient, monkeypatch: pytest.MonkeyPatch
+    program: CompiledTable, router: Showing, client: FoxgloveClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     faults = threading.Semaphore(0)
 
@@ -364,7 +364,9 @@ def test_nonsense_ends_its_own_connection_only(server: FoxgloveServer, client: F
     client.subscribe("imu_info")
 
 
-def test_a_slow_client_loses_the_oldest_messages(program: Program, router: Showing, client: FoxgloveClient) -> None:
+def test_a_slow_client_loses_the_oldest_messages(
+    program: CompiledTable, router: Showing, client: FoxgloveClient
+) -> None:
     client.subscribe("imu_info")
     router.wait_for(1)
     sent = 60 * foxglove.BACKLOG

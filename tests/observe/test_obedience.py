@@ -10,8 +10,8 @@ from textwrap import dedent
 import pytest
 
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Evidence
-from router.compiler.program import Program
 from router.datagrams import Wire
 from router.observe.obedience import Obedience, Reply, why_disobeyed
 from tests.tables import ROUTES
@@ -20,7 +20,7 @@ ROUTE, BOARD = "manual_drive", "driving_board"
 
 
 @cache
-def program(folder: Path) -> Program:
+def program(folder: Path) -> CompiledTable:
     """The rover's program with an `obeyed` that reads two motors and a state."""
     (folder / "table.yaml").write_text(
         dedent(f"""\
@@ -43,11 +43,11 @@ def program(folder: Path) -> Program:
 
 
 @pytest.fixture
-def rover(tmp_path_factory: pytest.TempPathFactory) -> Program:
+def rover(tmp_path_factory: pytest.TempPathFactory) -> CompiledTable:
     return program(tmp_path_factory.getbasetemp())
 
 
-def drive_diag(program: Program, **fields: object) -> Evidence:
+def drive_diag(program: CompiledTable, **fields: object) -> Evidence:
     case = program.envelope.cases["drive_diag"]
     return Evidence(ROUTE, BOARD, Wire(program.envelope).encode(case, case.message_class(**fields)))
 
@@ -64,7 +64,7 @@ MOTORS = {f"{end}_{side}_motor": {"rpm": 0.5} for end in ("front", "back") for s
     ],
 )
 def test_of_a_message_the_fields_of_the_condition_are_said(
-    rover: Program, fields: Mapping[str, object], said: str
+    rover: CompiledTable, fields: Mapping[str, object], said: str
 ) -> None:
     obedience = Obedience()
     obedience.note(drive_diag(rover, **fields), rover)
@@ -72,12 +72,12 @@ def test_of_a_message_the_fields_of_the_condition_are_said(
     assert text == f"it was sent manual_brake {{brake: true}}, and says drive_diag {said}"
 
 
-def test_a_board_that_says_nothing_is_said(rover: Program) -> None:
+def test_a_board_that_says_nothing_is_said(rover: CompiledTable) -> None:
     text = why_disobeyed(rover, ROUTE, BOARD, Obedience().replies())
     assert text == "it was sent manual_brake {brake: true}, and has sent no drive_diag since"
 
 
-def test_replies_last_until_the_deadman_changes(rover: Program) -> None:
+def test_replies_last_until_the_deadman_changes(rover: CompiledTable) -> None:
     obedience = Obedience()
     obedience.note(drive_diag(rover, state=1), rover)
     obedience.answered(Answer(ROUTE, BOARD, True, 432_000_000), rover)
@@ -88,7 +88,7 @@ def test_replies_last_until_the_deadman_changes(rover: Program) -> None:
     assert obedience.replies() == {}
 
 
-def test_what_a_reload_has_made_unreadable_is_skipped(rover: Program) -> None:
+def test_what_a_reload_has_made_unreadable_is_skipped(rover: CompiledTable) -> None:
     obedience = Obedience()
     obedience.note(Evidence(ROUTE, BOARD, b"\xff"), rover)
     obedience.note(Evidence("drive_motor", BOARD, drive_diag(rover).data), rover)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 from structlog.testing import capture_logs
 
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import Mismatch, Report
-from router.compiler.program import DeadmanPlan
 from router.log import logger
 from router.observe.reports import MOST_MISMATCHES, Reporter
 from router.table.addresses import Address

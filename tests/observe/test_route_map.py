@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.observe.route_map import NodeKind, deadman_edges, nodes_and_edges
 from router.table.model.routes import ANY
 from tests.tables import ROUTES
@@ -17,7 +17,7 @@ TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")
 
 
 @cache
-def program_of(name: str) -> Program:
+def program_of(name: str) -> CompiledTable:
     program = check_table(ROUTES / name).program
     assert program is not None
     return program
@@ -41,7 +41,7 @@ def test_links_are_named_as_the_metrics_name_what_flows(name: str) -> None:
             assert any(each[:3] == ("messages_dropped", edge.route, edge.label) for each in series)
 
 
-def test_what_a_deadman_sends_is_named_as_the_metrics_name_it(counted: Program) -> None:
+def test_what_a_deadman_sends_is_named_as_the_metrics_name_it(counted: CompiledTable) -> None:
     """Of boards, and of clients of gateways."""
     series = {each.labels for each, _ in counted.counters.series() if each.metric == "deadman_datagrams_sent"}
     edges = [*deadman_edges(counted)]

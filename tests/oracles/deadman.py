@@ -17,7 +17,7 @@ import errno
 from collections import Counter
 from dataclasses import dataclass, field
 
-from router.compiler.program import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan
 
 START, START_AGAIN, GREETING = 10_000_000_000, 1_000_000_000, 500_000_000
 

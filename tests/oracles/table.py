@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
-from router.compiler.program import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan
 from tests.oracles.ages_and_rates import Freshness, RateLimit
 from tests.oracles.deadman import Deadman, Deadmen
 from tests.oracles.frames import COLLECTED, FILTERED, INCOMPLETE, MAPPING_ERROR, Frames, Part

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from hypothesis import strategies as st
 
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Peer, Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
@@ -176,7 +176,7 @@ class FakeMirror:
 
 
 def recorder(mirror: FakeMirror, settings: RecordSettings) -> Recorder:
-    return Recorder(cast("Mirror", mirror), lambda: cast("Program", mirror.program), settings)
+    return Recorder(cast("Mirror", mirror), lambda: cast("CompiledTable", mirror.program), settings)
 
 
 def settings(directory: Path, **changed: Any) -> RecordSettings:

@@ -1,4 +1,4 @@
-"""Whatever comes, whenever, and whatever is done to the clock and the table: the stage does what plain models say."""
+"""Whatever comes, whenever, and whatever is done to clock and table: the simulation does what plain models say."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 from router.compiler import Checked, check_table
+from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.lookup import Definitions
-from router.compiler.program import DeadmanPlan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.rehearsal import (
     START,
@@ -253,12 +253,12 @@ def envelope(case: str, **payload: object) -> bytes:
 
 
 class Both:
-    """A stage and its model, which are given the same."""
+    """A simulation and its model, which are given the same."""
 
     def __init__(self, setting: Setting) -> None:
         self.setting, self.program = setting, checked(setting).program
         assert self.program is not None
-        self.stage, self.model = Rehearsal(self.program), Model(setting.model(), START)
+        self.simulation, self.model = Rehearsal(self.program), Model(setting.model(), START)
         self._count = 0
 
     def _next_number(self, sign: int = 1) -> int:
@@ -267,7 +267,7 @@ class Both:
         return sign * self._count
 
     def _wall(self, age: int) -> int:
-        return self.stage.now + self.stage.ahead - age
+        return self.simulation.now + self.simulation.ahead - age
 
     def receive(self, case: str, sender: int, age: int, sign: int, size: int, times: int) -> None:
         """`sender` chooses one of those that may send it."""
@@ -278,7 +278,7 @@ class Both:
         for _ in range(times):
             number = self._next_number(sign)
             data = envelope(case, number=number, filling=bytes(size))
-            self.stage.datagram("here", PEERS[source] if source else STRANGER, data, self._wall(age))
+            self.simulation.datagram("here", PEERS[source] if source else STRANGER, data, self._wall(age))
             self.model.datagram(
                 case, source, data, number, self._wall(age), {"latest": b"\0\1\0\0" + pack("<i", number)}
             )
@@ -288,24 +288,24 @@ class Both:
         for place in places:
             name = f"{self._next_number()}"
             data = envelope("part", frame=frame, count=count, place=place, name=name)
-            self.stage.datagram("here", PEERS["operator"], data, self._wall(age))
+            self.simulation.datagram("here", PEERS["operator"], data, self._wall(age))
             self.model.part("part", Part(frame, count, place, name.encode()), self._wall(age))
         self.compare()
 
     def take_from_ros(self, age: int, times: int) -> None:
         for _ in range(times):
             number = self._next_number()
-            self.stage.ros("orders", b"\0\1\0\0" + pack("<i", number), self._wall(age))
+            self.simulation.ros("orders", b"\0\1\0\0" + pack("<i", number), self._wall(age))
             self.model.ros("orders", envelope("orders", number=number), number, self._wall(age))
         self.compare()
 
     def pass_time(self, ns: int) -> None:
-        for each in (self.stage, self.model):
+        for each in (self.simulation, self.model):
             each.advance(each.now + ns)
         self.compare()
 
     def set_clock(self, ahead: int) -> None:
-        self.stage.set_clock(ahead)
+        self.simulation.set_clock(ahead)
         self.model.ahead = ahead
 
     def reload(self, number: int) -> None:
@@ -320,26 +320,28 @@ class Both:
         assert self.program is not None
         self.setting, self.program = setting, checked(setting).program_in(self.program.counters.continued())
         assert self.program is not None
-        self.stage.reload(self.program)
+        self.simulation.reload(self.program)
         self.model.reload(setting.model())
         self.compare()
 
     def restart(self) -> None:
-        self.stage.restart()
+        self.simulation.restart()
         self.model = Model(self.setting.model(), START)
 
     def close(self) -> None:
-        self.stage.close()
+        self.simulation.close()
         self.model.close()
         self.compare()
 
     def compare(self) -> None:
         """By target, in order; what a deadman does it may report before or after its datagram."""
-        happened = [event for event in self.stage.events if not isinstance(event, (Received, DeadmanChanged))]
-        changes = [(each.at, each.route, each.active) for each in self.stage.events if isinstance(each, DeadmanChanged)]
+        happened = [event for event in self.simulation.events if not isinstance(event, (Received, DeadmanChanged))]
+        changes = [
+            (each.at, each.route, each.active) for each in self.simulation.events if isinstance(each, DeadmanChanged)
+        ]
         assert _by_target(map(_happened, happened)) == _by_target(self.model.happened)
         assert changes == self.model.changes
-        for events in (self.stage.events, self.model.happened, self.model.changes):
+        for events in (self.simulation.events, self.model.happened, self.model.changes):
             events.clear()
 
 
@@ -421,7 +423,7 @@ def step_of(both: Both, noise: random.Random) -> None:
 
 @pytest.mark.parametrize("count", [40, pytest.param(1500, marks=pytest.mark.slow)])
 def test_long_histories_are_as_the_models_say(count: int) -> None:
-    """With one stage: what one leaves behind does not reach the next."""
+    """With one simulation: what one leaves behind does not reach the next."""
     both = Both(SETTINGS[0])
     for seed in range(count):
         noise = random.Random(seed)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from router.compiler.program import QosPlan, TopicPlan
+from router.compiler.compiled_table import QosPlan, TopicPlan
 from router.errors import SourceSpan
 from router.ros.router_node import RouterNode
 from router.table.model.settings import NodeSettings

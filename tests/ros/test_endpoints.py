@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.compiler.program import TopicPlan
+from router.compiler.compiled_table import TopicPlan
 from router.errors import StartError
 from router.ros.router_node import RouterNode
 from tests.ros.opening import RELIABLE, SPAN, open_ros, string_topic

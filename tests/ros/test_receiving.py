@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from router.clock import wall_ns
-from router.compiler.program import QosPlan, TopicPlan
+from router.compiler.compiled_table import QosPlan, TopicPlan
 from router.errors import StartError
 from router.ros.events import WaitSet
 from router.ros.node import RCL_ERRORS, close_node, open_node

@@ -24,7 +24,7 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from structlog.testing import capture_logs
 
-from router.compiler.program import QosPlan, TopicPlan
+from router.compiler.compiled_table import QosPlan, TopicPlan
 from router.errors import StartError
 from router.ros import events
 from router.ros.qos import ActualQos, incompatible_policies

@@ -23,7 +23,7 @@ from router.app.runtime import Runtime
 from router.carrier import events
 from router.carrier.forwarding_threads import ForwardingThreads
 from router.cli import run
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.image.image import Image
 from router.image.writer import write_image
 from router.net.sockets import ListeningSocket, open_sending
@@ -45,7 +45,7 @@ TRIPPED = "no commands arrive; the deadman sends in their place"
 ROOT = Path(__file__).parents[2]
 
 
-def head_start(program: Program) -> HeadStart:
+def head_start(program: CompiledTable) -> HeadStart:
     parts = marshal.loads(marshal.dumps(write_image(program).parts()))  # noqa: S302 - written here
     return HeadStart(Image(**parts), ())
 

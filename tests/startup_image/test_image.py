@@ -18,8 +18,8 @@ import pytest
 from router.app import Router
 from router.carrier.forwarding_threads import ForwardingThreads
 from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Counters
-from router.compiler.program import Program
 from router.types.protobuf import PayloadCase
 from tests.acceptance.payloads import FRAME, WIRE, sample
 from tests.acceptance.site import udp, wait_until
@@ -136,7 +136,7 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
     every = [(source, listener, each) for each in datagrams for source in SOURCES for listener in LISTENERS]
     sent = [each for each in every if each[:2] != ("tool", "exact")]
 
-    def outcome(run: Callable[[Program], AbstractContextManager[ForwardingThreads]]) -> Outcome:
+    def outcome(run: Callable[[CompiledTable], AbstractContextManager[ForwardingThreads]]) -> Outcome:
         program = checked.program_in(Counters())
         assert program
         indexes = {
@@ -154,7 +154,7 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
         return Outcome(got, {f"{metric}{labels}": carrier.counts[at] for (metric, labels), at in indexes.items()})
 
     @contextmanager
-    def by_image(program: Program) -> Iterator[ForwardingThreads]:
+    def by_image(program: CompiledTable) -> Iterator[ForwardingThreads]:
         started = head_start(program)
         try:
             yield started.forwarding.threads
@@ -162,7 +162,7 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
             started.close()
 
     @contextmanager
-    def by_program(program: Program) -> Iterator[ForwardingThreads]:
+    def by_program(program: CompiledTable) -> Iterator[ForwardingThreads]:
         with Router(program) as router:
             yield router._runtime.plane._threads
 
@@ -192,7 +192,7 @@ def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) ->
             assert basestation.recv(2000) == datagram
 
 
-def _has_received(carrier: ForwardingThreads, program: Program, datagrams: int) -> bool:
+def _has_received(carrier: ForwardingThreads, program: CompiledTable, datagrams: int) -> bool:
     counts = carrier.counters(program.counters.size)
     return datagrams <= sum(counts[at] for series, at in program.counters.series() if series.metric == _RECEIVED)
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from router.compiler.program import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan
 from router.datagrams import Decoded, Wire, wire_of_protos
 from router.table.model import RouteTable
 from router.tools.board import FRAME_TIMEOUT, Board, Change, Frames, State, Stop, boards, is_part

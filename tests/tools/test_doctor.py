@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from router.compiler import check_table
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.errors import StartError
 from router.observe.problems import Kind, Problem
 from router.recording.writer import RecordingDirectory
@@ -69,7 +69,7 @@ def table(tmp_path: Path) -> Path:
     return path
 
 
-def compiled(table: Path) -> Program:
+def compiled(table: Path) -> CompiledTable:
     program = check_table(table).program
     assert program is not None
     return program
@@ -79,7 +79,7 @@ def texts(found: list[CheckResult], grade: Grade) -> list[str]:
     return [finding.text for finding in found if finding.grade is grade]
 
 
-def rewritten(table: Path, old: str, new: str) -> Program:
+def rewritten(table: Path, old: str, new: str) -> CompiledTable:
     table.write_text(table.read_text().replace(old, new))
     return compiled(table)
 
@@ -240,7 +240,7 @@ def test_an_open_ros_domain_is_a_warning(
     )
 
 
-def on_interface(table: Path, name: str) -> Program:
+def on_interface(table: Path, name: str) -> CompiledTable:
     return rewritten(table, "receive_buffer:", f"interface: {name}, receive_buffer:")
 
 
@@ -288,7 +288,7 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     assert gist(receive_buffers(compiled(table)), "the kernel does not show here") == [(Grade.WARNING, True)]
 
 
-def recorded(table: Path, folder: Path, keep: str, more: str = "") -> Program:
+def recorded(table: Path, folder: Path, keep: str, more: str = "") -> CompiledTable:
     table.write_text(f"{table.read_text()}record: {{directory: {folder}, retention: {keep}{more}}}\n")
     return compiled(table)
 
@@ -441,7 +441,7 @@ def test_who_answers_a_ping() -> None:
 
 
 @contextmanager
-def serving(program: Program, *problems: Problem) -> Iterator[None]:
+def serving(program: CompiledTable, *problems: Problem) -> Iterator[None]:
     """A router that runs the program's table, and in which this is wrong."""
     assert program.table.http is not None
     with answering("", program.table.http.address.value, problems=problems, table=program.table.sha256):

@@ -64,7 +64,7 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
     memcpy(record + 1, carrier->routing.datagram, kept);
     uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
-    if (!ring_put(to, record, record->size)) stage_count(&carrier->routing.stage, lost, 1);
+    if (!ring_put(to, record, record->size)) env_count(&carrier->routing.env, lost, 1);
 }
 
 /* ---- receiving ---- */
@@ -113,7 +113,7 @@ static void handle(struct carrier *carrier, struct received *received) {
     received->received_at = wall_ns();
     int reason = route_datagram(&carrier->routing, received);
     if (received->route)
-        count_duration(carrier->routing.stage.counters, received->route->duration, LATENCY, boottime_ns() - received->now);
+        count_duration(carrier->routing.env.counters, received->route->duration, LATENCY, boottime_ns() - received->now);
     struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
     if (observed) mirror(carrier, observed, received, reason);
     edition_end(&carrier->edition);
@@ -142,10 +142,10 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
 }
 
 static void serve_due(struct carrier *carrier) {
-    int64_t due = atomic_load_explicit(&carrier->routing.stage.timers->wakes_at, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&carrier->routing.env.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return;
     int64_t now = boottime_ns();
-    if (due <= now) timers_serve(carrier->routing.stage.timers, now);
+    if (due <= now) timers_serve(carrier->routing.env.timers, now);
 }
 
 static void drain(struct carrier *carrier, const struct listener *listener) {
@@ -260,11 +260,11 @@ static void *timer_thread(void *of) {
     int64_t turn = 0;
     run_first();
     while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->routing.stage.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        struct pollfd waiting[] = {{carrier->routing.env.timers->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
         poll(waiting, 2, until_turn(carrier, turn));
         eventfd_t ignored;
         if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
-        if (waiting[0].revents) timers_serve(carrier->routing.stage.timers, boottime_ns());
+        if (waiting[0].revents) timers_serve(carrier->routing.env.timers, boottime_ns());
         if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
             turn = monotonic_ns() + atomic_load(&carrier->interval);
@@ -278,7 +278,7 @@ static void *timer_thread(void *of) {
 struct carrier *carrier_open(struct timers *timers, counter *counters, struct ring *events, struct ring *published) {
     struct carrier *carrier = calloc(1, sizeof *carrier);
     if (!carrier) return NULL;
-    bool is_open = stage_open(&carrier->routing.stage, counters, events, timers);
+    bool is_open = env_open(&carrier->routing.env, counters, events, timers);
     carrier->routing.published = published;
     timers->heard = counters;
     carrier->notify = -1;
@@ -324,7 +324,7 @@ void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
 }
 
 bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count) {
-    return counters_copy(&carrier->edition, carrier->routing.stage.counters, to, count);
+    return counters_copy(&carrier->edition, carrier->routing.env.counters, to, count);
 }
 
 void carrier_stop_receiving(struct carrier *carrier) {
@@ -343,6 +343,6 @@ void carrier_close(struct carrier *carrier) {
     }
     if (carrier->epoll >= 0) close(carrier->epoll);
     if (carrier->wake >= 0) close(carrier->wake);
-    stage_close(&carrier->routing.stage);
+    env_close(&carrier->routing.env);
     free(carrier);
 }

@@ -12,7 +12,7 @@
 #include "threads.h"
 
 struct client_deadmen {
-    struct stage stage; /* first: `brake` gets a pointer to it */
+    struct thread_env env; /* first: `brake` gets a pointer to it */
     struct timers *group;
     pthread_t thread;
     pthread_cond_t changed;
@@ -32,11 +32,11 @@ struct client_deadmen {
 /* ---- with the lock held ---- */
 
 /* Keep the only datagram of a deadman as the output of the machine. Only one deadman is served at a time. */
-static int keep_message(struct stage *stage, const struct deadman_destination *to,
+static int keep_message(struct thread_env *env, const struct deadman_destination *to,
                         const struct deadman_datagram *datagram) {
-    struct client_deadmen *of = (struct client_deadmen *)stage;
-    stage->machine.output.size = 0;
-    if (!append(&stage->machine.output, datagram->data, datagram->size)) return ENOMEM;
+    struct client_deadmen *of = (struct client_deadmen *)env;
+    env->machine.output.size = 0;
+    if (!append(&env->machine.output, datagram->data, datagram->size)) return ENOMEM;
     of->to = *to;
     of->has_message = true;
     return BRAKE_LATER;
@@ -46,7 +46,7 @@ static int keep_message(struct stage *stage, const struct deadman_destination *t
 static void publish_message(struct client_deadmen *of, struct timer *from) {
     of->has_message = false;
     const char *why = publish_unlocked(&of->publishing, &of->group->lock, of->to.publisher, of->to.id,
-                                       &of->stage.machine.output);
+                                       &of->env.machine.output);
     if (!of->group->is_abandoned) deadman_settle(of->group, from, &of->to, why, boottime_ns());
 }
 
@@ -108,15 +108,15 @@ static void wake_up(struct client_deadmen *of) { eventfd_write(of->wake, 1); }
 struct client_deadmen *client_deadmen_open(counter *counters, struct ring *events) {
     struct client_deadmen *of = calloc(1, sizeof *of);
     if (!of) return NULL;
-    bool is_open = stage_open(&of->stage, counters, events, NULL);
-    of->stage.brake = keep_message;
+    bool is_open = env_open(&of->env, counters, events, NULL);
+    of->env.brake = keep_message;
     of->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-    of->group = is_open && of->wake >= 0 ? timers_open_on(&of->stage, true) : NULL;
+    of->group = is_open && of->wake >= 0 ? timers_open_on(&of->env, true) : NULL;
     condition_open(&of->changed);
     if (of->group) return of;
     pthread_cond_destroy(&of->changed);
     if (of->wake >= 0) close(of->wake);
-    stage_close(&of->stage);
+    env_close(&of->env);
     free(of);
     return NULL;
 }

@@ -75,14 +75,14 @@ struct collector {
 enum { LONGEST_DETAIL = 80 };
 
 /* Report the loss of a datagram or a frame for all topics of the route. */
-static void lose_for_all(struct stage *stage, const struct targets *to, int64_t now, struct lost_event lost,
+static void lose_for_all(struct thread_env *env, const struct targets *to, int64_t now, struct lost_event lost,
                          const char *detail) {
     for (uint32_t index = 0; index < to->count; index++)
-        lose_message(stage, to, &to->targets[index], now, lost, detail);
+        lose_message(env, to, &to->targets[index], now, lost, detail);
 }
 
 static void lose(const struct collector *collector, int64_t now, const char *detail) {
-    lose_for_all(collector->timers->stage, collector->to, now, (struct lost_event){.reason = DROP_INCOMPLETE}, detail);
+    lose_for_all(collector->timers->env, collector->to, now, (struct lost_event){.reason = DROP_INCOMPLETE}, detail);
 }
 
 static void lose_large(const struct collector *collector, uint64_t count, int64_t now) {
@@ -96,7 +96,7 @@ static void count_all(const struct collector *collector, bool is_kept) {
     const struct targets *to = collector->to;
     for (uint32_t index = 0; index < to->count; index++) {
         const struct target *target = &to->targets[index];
-        stage_count(collector->timers->stage, is_kept ? target->collected : target->filtered, 1);
+        env_count(collector->timers->env, is_kept ? target->collected : target->filtered, 1);
     }
 }
 
@@ -328,18 +328,18 @@ void collector_close(struct collector *collector) {
 /* ---- datagrams ---- */
 
 /* Report that `collect` refuses a datagram. Returns false. */
-static bool refuse(struct stage *stage, const struct targets *to, const struct message *message, int reason,
+static bool refuse(struct thread_env *env, const struct targets *to, const struct message *message, int reason,
                    const char *detail) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
-    lose_for_all(stage, to, message->now, lost, detail);
+    lose_for_all(env, to, message->now, lost, detail);
     return false;
 }
 
 /* Report that the machine refuses it. Returns false. */
-static bool refuse_value(struct stage *stage, const struct targets *to, const struct message *message, int reason) {
+static bool refuse_value(struct thread_env *env, const struct targets *to, const struct message *message, int reason) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
     for (uint32_t index = 0; index < to->count; index++)
-        lose_refused(stage, to, &to->targets[index], message->now, lost);
+        lose_refused(env, to, &to->targets[index], message->now, lost);
     return false;
 }
 
@@ -366,27 +366,27 @@ static bool set_name(struct name *name, const struct collect *of, const struct v
 }
 
 /* Determine the frame and the part of a datagram. Return false, with all losses counted, if there is none. */
-static bool identify(struct stage *stage, const struct targets *to, const struct message *message, struct part *part) {
+static bool identify(struct thread_env *env, const struct targets *to, const struct message *message, struct part *part) {
     const struct collect *of = to->collect;
-    struct machine *machine = &stage->machine;
+    struct machine *machine = &env->machine;
     struct value by, count, order;
     char detail[LONGEST_DETAIL], numbers[2][24];
     uint32_t at;
-    if (!read_datagram(machine, to->layout, to->sources, message->datagram)) return refuse_value(stage, to, message, DROP_MAPPING_ERROR);
+    if (!read_datagram(machine, to->layout, to->sources, message->datagram)) return refuse_value(env, to, message, DROP_MAPPING_ERROR);
     part->name.sender = of->senders[message->datagram->column];
     int outcome = evaluate_value(machine, &of->by, &by, &at);
     if (outcome == EVALUATED && !set_name(&part->name, of, &by)) {
         snprintf(detail, sizeof detail, "'by' of %" PRIu32 " bytes, more than %d", by.size, LONGEST_NAME);
-        return refuse(stage, to, message, DROP_MAPPING_ERROR, detail);
+        return refuse(env, to, message, DROP_MAPPING_ERROR, detail);
     }
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->count, &count, &at);
     if (outcome == EVALUATED) outcome = evaluate_value(machine, &of->order, &order, &at);
-    if (outcome != EVALUATED) return refuse_value(stage, to, message, outcome);
+    if (outcome != EVALUATED) return refuse_value(env, to, message, outcome);
     if (!has_place(of, count.integer, order.integer)) {
         printed(numbers[0], sizeof numbers[0], count.integer, of->signs & FIRST_UNSIGNED);
         printed(numbers[1], sizeof numbers[1], order.integer, of->signs & SECOND_UNSIGNED);
         snprintf(detail, sizeof detail, "a frame of %s has no part %s", numbers[0], numbers[1]);
-        return refuse(stage, to, message, DROP_MAPPING_ERROR, detail);
+        return refuse(env, to, message, DROP_MAPPING_ERROR, detail);
     }
     part->count = count.bits;
     part->index = (uint32_t)order.bits; /* has no meaning for a frame that is too large */
@@ -421,12 +421,12 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
     return true;
 }
 
-bool collect(struct stage *stage, const struct targets *to, struct message *message) {
+bool collect(struct thread_env *env, const struct targets *to, struct message *message) {
     struct part part;
-    if (!identify(stage, to, message, &part)) return false;
-    const struct frame *frame = take(stage->timers, to->collect->collector, &part, message);
+    if (!identify(env, to, message, &part)) return false;
+    const struct frame *frame = take(env->timers, to->collect->collector, &part, message);
     if (!frame) return false;
     message->is_read = true;
-    message->outcome = read_frame(&stage->machine, to, frame, message->datagram) ? EVALUATED : DROP_MAPPING_ERROR;
+    message->outcome = read_frame(&env->machine, to, frame, message->datagram) ? EVALUATED : DROP_MAPPING_ERROR;
     return true;
 }

@@ -31,12 +31,12 @@ struct collect {
 };
 
 /* Open a collector; close one that is in no group of timers. One thread uses it, after `timers_change` has set the targets
- * of its frames. The stage of the group counts losses. Returns NULL if memory runs out. */
+ * of its frames. The environment of the group counts losses. Returns NULL if memory runs out. */
 struct collector *collector_open(int64_t timeout);
 void collector_close(struct collector *collector);
 
 /* Keep a datagram for targets with `collect`. Return whether it completes its frame: then `message` is the frame, and the
  * caller delivers it. Otherwise the datagram is counted, now or when its frame ends. */
-bool collect(struct stage *stage, const struct targets *to, struct message *message);
+bool collect(struct thread_env *env, const struct targets *to, struct message *message);
 
 #endif

@@ -54,7 +54,7 @@ struct deadman {
 /* Report an event without a limit: if there is no room, drop the oldest event. */
 static void report_event(struct timers *timers, void *event, size_t size, const char *text) {
     struct event_head oldest;
-    struct ring *events = timers->stage->reporter.events;
+    struct ring *events = timers->env->reporter.events;
     if (!events) return;
     while (!put_event(events, event, size, text)) ring_drop(events, &oldest, sizeof oldest);
 }
@@ -76,7 +76,7 @@ static void report_error(struct timers *timers, const struct deadman *deadman, c
 static void note(struct timers *timers, enum action action, const struct deadman *deadman) {
     struct actions *observed = atomic_load_explicit(&timers->actions, memory_order_acquire);
     struct action_record record = {.action = action, .route = deadman->id, .target = NO_NAME, .topic = NO_NAME};
-    if (observed) actions_note(observed, timers->stage->counters, record, NULL, 0);
+    if (observed) actions_note(observed, timers->env->counters, record, NULL, 0);
 }
 
 static void note_brake(struct timers *timers, const struct deadman *deadman, const struct deadman_destination *to,
@@ -84,18 +84,18 @@ static void note_brake(struct timers *timers, const struct deadman *deadman, con
     struct actions *observed = atomic_load_explicit(&timers->actions, memory_order_acquire);
     struct action_record record = {.action = ACTION_BRAKED, .route = deadman->id, .target = to->id, .topic = NO_NAME,
                                    .error = error};
-    if (observed) actions_note(observed, timers->stage->counters, record, datagram->data, datagram->size);
+    if (observed) actions_note(observed, timers->env->counters, record, datagram->data, datagram->size);
 }
 
 /* Send the datagrams for a destination. Return 0, BRAKE_LATER, or the last error. */
 static int send_to(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to) {
     int failed = 0;
     for (uint32_t index = 0; index < to->count; index++) {
-        int error = timers->stage->brake(timers->stage, to, &to->datagrams[index]);
+        int error = timers->env->brake(timers->env, to, &to->datagrams[index]);
         if (error) failed = error;
         if (error == BRAKE_LATER) continue;
         note_brake(timers, deadman, to, &to->datagrams[index], error);
-        stage_count(timers->stage, error ? to->send_errors : to->sent, 1);
+        env_count(timers->env, error ? to->send_errors : to->sent, 1);
         if (error) report_error(timers, deadman, to, error, "");
     }
     return failed;
@@ -129,7 +129,7 @@ static void report_answer(struct timers *timers, const struct deadman *deadman, 
 static void set_disobeys(struct timers *timers, struct deadman *deadman, uint32_t index, bool disobeys) {
     if (deadman->answers[index].disobeys == disobeys) return;
     deadman->answers[index].disobeys = disobeys;
-    counter_set(timers->stage->counters, deadman->destinations[index].disobeyed, disobeys);
+    counter_set(timers->env->counters, deadman->destinations[index].disobeyed, disobeys);
 }
 
 /* Await answers of destinations from `now` on; 0: no longer. */
@@ -157,7 +157,7 @@ static void take_obedience(struct timers *timers, struct deadman *deadman, uint3
     struct answer *answer = &deadman->answers[index];
     const struct deadman_destination *to = &deadman->destinations[index];
     int64_t after = arrived - deadman->tripped_at;
-    if (!answer->is_timed) count_duration(timers->stage->counters, to->stopping, STOPPING, after);
+    if (!answer->is_timed) count_duration(timers->env->counters, to->stopping, STOPPING, after);
     if (!answer->is_timed || answer->disobeys) report_answer(timers, deadman, EVENT_OBEYED, to->id, after);
     set_disobeys(timers, deadman, index, false);
     answer->is_timed = true;
@@ -182,7 +182,7 @@ static void release(struct timers *timers, struct deadman *deadman) {
     if (!deadman->has_tripped) return;
     set_tripped(deadman, false);
     await_answers(timers, deadman, deadman->own, 0);
-    counter_set(timers->stage->counters, deadman->active, 0);
+    counter_set(timers->env->counters, deadman->active, 0);
     report(timers, EVENT_RELEASED, deadman);
     note(timers, ACTION_RELEASED, deadman);
 }
@@ -339,8 +339,8 @@ static void serve(struct timers *timers, struct timer *timer, int64_t now) {
     set_tripped(deadman, true);
     deadman->tripped_at = now;
     await_answers(timers, deadman, deadman->armed, now);
-    counter_set(timers->stage->counters, deadman->active, 1);
-    stage_count(timers->stage, deadman->trips, 1);
+    counter_set(timers->env->counters, deadman->active, 1);
+    env_count(timers->env, deadman->trips, 1);
     note(timers, ACTION_TRIPPED, deadman);
     send_all(timers, deadman, deadman->armed);
     report(timers, EVENT_TRIPPED, deadman);
@@ -408,7 +408,7 @@ static void inherit_start(struct timers *timers, struct deadman *next, struct de
 /* Let `next` await the answers that `earlier` awaits; of a destination that `earlier` does not watch, from now on. */
 static void pass_answers(struct timers *timers, struct deadman *next, struct deadman *earlier) {
     next->tripped_at = earlier->tripped_at;
-    await_answers(timers, next, next->armed, timers->stage->now(timers->stage));
+    await_answers(timers, next, next->armed, timers->env->now(timers->env));
     for (uint64_t left = earlier->watched; left; left &= left - 1) {
         uint32_t index = (uint32_t)__builtin_ctzll(left);
         struct answer passed = earlier->answers[index];
@@ -440,8 +440,8 @@ static void inherit_deadline(struct timers *timers, struct deadman *next, struct
     set_tripped(earlier, false);
     set_tripped(next, true);
     pass_answers(timers, next, earlier);
-    counter_set(timers->stage->counters, earlier->active, 0);
-    counter_set(timers->stage->counters, next->active, 1);
+    counter_set(timers->env->counters, earlier->active, 0);
+    counter_set(timers->env->counters, next->active, 1);
 }
 
 /* Pass deadline and state on. */
@@ -600,7 +600,7 @@ static bool is_served(const struct timers *timers, const struct timer *timer) {
 
 void deadman_settle(struct timers *timers, struct timer *timer, const struct deadman_destination *to, const char *why,
                     int64_t now) {
-    stage_count(timers->stage, why ? to->send_errors : to->sent, 1);
+    env_count(timers->env, why ? to->send_errors : to->sent, 1);
     if (!why || !is_served(timers, timer)) return;
     struct deadman *deadman = timer->kind == &STARTING ? starting(timer) : (struct deadman *)timer;
     report_error(timers, deadman, to, 0, why);
@@ -624,12 +624,12 @@ int command_send_at(struct timers *timers, struct sender *sender, const void *da
 int command_send(struct timers *timers, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count) {
     if (!count) {
-        int64_t now = expires == NEVER ? 0 : timers->stage->now(timers->stage);
+        int64_t now = expires == NEVER ? 0 : timers->env->now(timers->env);
         return command_send_at(timers, sender, data, size, expires, feeds, count, now);
     }
     pthread_mutex_lock(&timers->lock);
     int error = command_send_at(timers, sender, data, size, expires, feeds, count,
-                                timers->stage->now(timers->stage));
+                                timers->env->now(timers->env));
     pthread_mutex_unlock(&timers->lock);
     return error;
 }

@@ -121,7 +121,7 @@ void deadman_feed(struct timers *timers, struct deadman *deadman, int64_t now);
 void deadman_end_by_thread(struct timers *timers, struct deadman *deadman);
 void deadman_schedule_end(struct timers *timers, struct timer *timer); /* with the lock held */
 
-/* Settle a datagram that a stage's `brake` was to send later: `why` it failed, or NULL. The lock is held. The deadman may
+/* Settle a datagram that an environment's `brake` was to send later: `why` it failed, or NULL. The lock is held. The deadman may
  * be gone. */
 void deadman_settle(struct timers *timers, struct timer *timer, const struct deadman_destination *to, const char *why,
                     int64_t now);

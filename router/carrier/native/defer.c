@@ -25,7 +25,7 @@ static void pass_on(struct timers *timers, struct deferral *deferral, const uint
     bool can_leave = size <= LONGEST_SENT; /* otherwise sending fails, which is counted */
     if (deferral->pacer && !deferral->has_ended && can_leave)
         pacer_queue(timers, deferral->pacer, of, data, size, expires, now);
-    else if (!deliver_now(timers->stage, of->to, of->target, data, size, expires, now))
+    else if (!deliver_now(timers->env, of->to, of->target, data, size, expires, now))
         timers->is_abandoned = true;
 }
 
@@ -41,9 +41,9 @@ static void forget(struct timers *timers, struct deferral *deferral) {
 }
 
 /* Keep a message until it may pass. The machine's output is not copied. */
-static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
+static void hold(struct thread_env *env, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
                  int64_t now) {
-    struct output *written = &stage->machine.output;
+    struct output *written = &env->machine.output;
     deferral->held.size = 0;
     if (data == written->data) {
         exchange(&deferral->held, written);
@@ -54,7 +54,7 @@ static void hold(struct stage *stage, struct deferral *deferral, const uint8_t *
     deferral->is_held = true;
     deferral->expires = expires;
     deferral->arrived = now;
-    timer_set_due(stage->timers, &deferral->timer, deferral->limit.next_pass);
+    timer_set_due(env->timers, &deferral->timer, deferral->limit.next_pass);
 }
 
 /* Deliver the held message, unless it has expired. */
@@ -62,27 +62,27 @@ static void release(struct timers *timers, struct deferral *deferral, int64_t no
     if (!deferral->is_held) return;
     forget(timers, deferral);
     if (now > deferral->expires) {
-        lose_stale(timers->stage, deferral->of.to, deferral->of.target, now, deferral->expires, REFUSED_WAITING);
+        lose_stale(timers->env, deferral->of.to, deferral->of.target, now, deferral->expires, REFUSED_WAITING);
         return;
     }
     struct output *held = &deferral->held;
     if (deferral->of.target->topic) { /* which gets the machine's output */
-        exchange(held, &timers->stage->machine.output);
-        held = &timers->stage->machine.output;
+        exchange(held, &timers->env->machine.output);
+        held = &timers->env->machine.output;
     }
     timers->arrived = deferral->arrived;
     pass_on(timers, deferral, held->data, held->size, deferral->expires, now);
     timers->arrived = NEVER;
 }
 
-static void offer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
+static void offer(struct thread_env *env, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires,
                   int64_t now) {
-    if (deferral->is_held) stage_count(stage->timers->stage, deferral->of.target->dropped[DROP_RATE_LIMITED], 1);
+    if (deferral->is_held) env_count(env->timers->env, deferral->of.target->dropped[DROP_RATE_LIMITED], 1);
     if (limit_passes(&deferral->limit, now)) {
-        forget(stage->timers, deferral);
-        pass_on(stage->timers, deferral, data, size, expires, now);
+        forget(env->timers, deferral);
+        pass_on(env->timers, deferral, data, size, expires, now);
     } else {
-        hold(stage, deferral, data, size, expires, now);
+        hold(env, deferral, data, size, expires, now);
     }
 }
 
@@ -98,7 +98,7 @@ static void adopt(struct timers *timers, struct timer *timer, const struct targe
     struct deferral *deferral = (struct deferral *)timer;
     int64_t period = target->period;
     if (period != deferral->limit.period) {
-        release(timers, deferral, timers->stage->now(timers->stage));
+        release(timers, deferral, timers->env->now(timers->env));
         if (timers->is_abandoned) return;
         deferral->limit = (struct limit){period, period - period / 2, -period};
     }
@@ -120,10 +120,10 @@ static const struct timer_kind DEFERRAL = {.serve = serve, .adopt = adopt, .end 
 
 /* ---- public ---- */
 
-bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now) {
-    struct timers *timers = stage->timers;
+bool defer(struct thread_env *env, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now) {
+    struct timers *timers = env->timers;
     pthread_mutex_lock(&timers->lock);
-    if (deferral->limit.period && !deferral->has_ended) offer(stage, deferral, data, size, expires, now);
+    if (deferral->limit.period && !deferral->has_ended) offer(env, deferral, data, size, expires, now);
     else pass_on(timers, deferral, data, size, expires, now);
     bool goes_on = !timers->is_abandoned;
     pthread_mutex_unlock(&timers->lock);
@@ -133,7 +133,7 @@ bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, 
 void deferral_supersede(struct timers *timers, struct deferral *deferral, int64_t now) {
     if (deferral->is_held && deferral->arrived <= timers->arrived) {
         forget(timers, deferral);
-        lose_superseded(timers->stage, &deferral->of, now);
+        lose_superseded(timers->env, &deferral->of, now);
     }
     if (deferral->of.queued) pacer_supersede(timers, deferral->pacer, &deferral->of, now);
 }

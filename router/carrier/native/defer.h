@@ -18,7 +18,7 @@ void deferral_close(struct deferral *deferral);
 
 /* Deliver a message to the target of a deferral, now or later: `data` is the machine's output, or a datagram. Return false
  * if the thread was abandoned. */
-bool defer(struct stage *stage, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now);
+bool defer(struct thread_env *env, struct deferral *deferral, const uint8_t *data, size_t size, int64_t expires, int64_t now);
 
 /* Drop what is held and queued of this deferral, and arrived before the command that is being sent. The lock is held. */
 void deferral_supersede(struct timers *timers, struct deferral *deferral, int64_t now);

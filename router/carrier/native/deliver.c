@@ -10,7 +10,7 @@
 
 /* One message on its way to one target. */
 struct delivery {
-    struct stage *stage;
+    struct thread_env *env;
     const struct targets *to;
     const struct target *target;
     struct message *message;
@@ -23,52 +23,52 @@ struct delivery {
 
 enum { LONGEST_REFUSED = 48 /* reported bytes of a text */ };
 
-static void count(const struct delivery *of, uint32_t which) { stage_count(of->stage, which, 1); }
+static void count(const struct delivery *of, uint32_t which) { env_count(of->env, which, 1); }
 
-static void note_lost(struct actions *actions, const struct stage *stage, const struct lost_event *lost, const char *text) {
+static void note_lost(struct actions *actions, const struct thread_env *env, const struct lost_event *lost, const char *text) {
     struct action_record action = {.action = ACTION_LOST, .route = lost->route, .target = lost->target, .topic = lost->topic,
                                    .reason = lost->reason, .error = lost->error, .refusal = lost->refusal};
-    actions_note(actions, stage->counters, action, text, strlen(text));
+    actions_note(actions, env->counters, action, text, strlen(text));
 }
 
-void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+void lose_message(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost, const char *text) {
     lost.route = to->route;
     lost.topic = to->topic;
     lost.target = target->id;
     lost.counter = target->dropped[lost.reason];
-    stage_count(stage, lost.counter, 1);
-    report_loss(&stage->reporter, now, lost, text);
-    struct actions *observed = target->topic ? NULL : stage_actions(stage);
-    if (observed) note_lost(observed, stage, &lost, text);
+    env_count(env, lost.counter, 1);
+    report_loss(&env->reporter, now, lost, text);
+    struct actions *observed = target->topic ? NULL : env_actions(env);
+    if (observed) note_lost(observed, env, &lost, text);
 }
 
-void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+void lose_refused(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost) {
-    const struct value *refused = &stage->machine.refused;
+    const struct value *refused = &env->machine.refused;
     char text[LONGEST_REFUSED + 1] = {0};
     size_t size = refused->size < LONGEST_REFUSED ? refused->size : LONGEST_REFUSED;
     if (size) memcpy(text, refused->bytes, size);
-    lost.refusal = stage->machine.refusal;
-    lose_message(stage, to, target, now, lost, text);
+    lost.refusal = env->machine.refusal;
+    lose_message(env, to, target, now, lost, text);
 }
 
-void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
+void lose_stale(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
                 enum refused since) {
     struct refusal refusal = {.kind = since, .values = {now - expires + to->ttl, to->ttl}};
-    lose_message(stage, to, target, now, (struct lost_event){.reason = DROP_STALE, .refusal = refusal}, "");
+    lose_message(env, to, target, now, (struct lost_event){.reason = DROP_STALE, .refusal = refusal}, "");
 }
 
 /* Report a loss. Returns false. */
 static bool lose(const struct delivery *of, struct lost_event lost, const char *text) {
-    lose_message(of->stage, of->to, of->target, of->message->now, lost, text);
+    lose_message(of->env, of->to, of->target, of->message->now, lost, text);
     return false;
 }
 
 /* Report that a place in the table refuses the message. Returns false. */
 static bool refuse(const struct delivery *of, int reason, uint32_t place) {
     struct lost_event lost = {.reason = (uint32_t)reason, .generation = of->to->generation, .place = place};
-    lose_refused(of->stage, of->to, of->target, of->message->now, lost);
+    lose_refused(of->env, of->to, of->target, of->message->now, lost);
     return false;
 }
 
@@ -93,7 +93,7 @@ bool read_datagram(struct machine *machine, const struct layout *layout, const s
 static bool is_readable(const struct delivery *of) {
     struct message *message = of->message;
     if (!message->is_read) {
-        bool is_well_formed = read_datagram(&of->stage->machine, of->to->layout, of->to->sources, message->datagram);
+        bool is_well_formed = read_datagram(&of->env->machine, of->to->layout, of->to->sources, message->datagram);
         message->outcome = is_well_formed ? EVALUATED : DROP_MAPPING_ERROR;
         message->is_read = true;
     }
@@ -112,7 +112,7 @@ static bool is_wanted(const struct delivery *of) {
 static bool meets_condition(const struct delivery *of) {
     bool is_true;
     uint32_t at;
-    int outcome = evaluate_condition(&of->stage->machine, &of->target->condition, &is_true, &at);
+    int outcome = evaluate_condition(&of->env->machine, &of->target->condition, &is_true, &at);
     if (outcome != EVALUATED) return refuse(of, outcome, PLACE_CONDITION);
     if (!is_true) count(of, of->target->filtered);
     return is_true;
@@ -126,9 +126,9 @@ static int64_t expiry(const struct delivery *of) {
 
 static bool is_fresh(const struct delivery *of) {
     if (of->expires == NEVER) return true;
-    int64_t now = of->stage->now(of->stage);
+    int64_t now = of->env->now(of->env);
     if (now <= of->expires) return true;
-    lose_stale(of->stage, of->to, of->target, now, of->expires, of->message->since);
+    lose_stale(of->env, of->to, of->target, now, of->expires, of->message->since);
     return false;
 }
 
@@ -141,10 +141,10 @@ static bool keeps_rate(const struct delivery *of) {
 
 static bool is_written(struct delivery *of) {
     uint32_t at;
-    int outcome = evaluate_message(&of->stage->machine, &of->target->message, &at);
+    int outcome = evaluate_message(&of->env->machine, &of->target->message, &at);
     if (outcome != EVALUATED) return refuse(of, outcome, PLACE_OPERATIONS + at);
-    of->data = of->stage->machine.output.data;
-    of->size = of->stage->machine.output.size;
+    of->data = of->env->machine.output.data;
+    of->size = of->env->machine.output.size;
     return true;
 }
 
@@ -168,54 +168,54 @@ static enum drop_reason drop_reason_of(int error) {
     return is_full ? DROP_SEND_BUFFER_FULL : DROP_SEND_ERROR;
 }
 
-static void lose_unsent(struct stage *stage, const struct targets *to, const struct target *target, int64_t expires,
+static void lose_unsent(struct thread_env *env, const struct targets *to, const struct target *target, int64_t expires,
                         int64_t now, int error) {
-    if (error == COMMAND_STALE) lose_stale(stage, to, target, stage->now(stage), expires, REFUSED_WAITING);
-    else lose_message(stage, to, target, now, (struct lost_event){.reason = drop_reason_of(error), .error = error}, "");
+    if (error == COMMAND_STALE) lose_stale(env, to, target, env->now(env), expires, REFUSED_WAITING);
+    else lose_message(env, to, target, now, (struct lost_event){.reason = drop_reason_of(error), .error = error}, "");
 }
 
-static bool publish_it(struct stage *stage, const struct targets *to, const struct target *target, int64_t now) {
+static bool publish_it(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now) {
     const char *why;
-    switch (stage->publish(stage, target, &why)) {
-    case PUBLISHED: stage_count(stage, target->delivered, 1); return true;
+    switch (env->publish(env, target, &why)) {
+    case PUBLISHED: env_count(env, target->delivered, 1); return true;
     case PUBLISH_FAILED:
-        lose_message(stage, to, target, now, (struct lost_event){.reason = DROP_PUBLISH_ERROR}, why);
+        lose_message(env, to, target, now, (struct lost_event){.reason = DROP_PUBLISH_ERROR}, why);
         return true;
     default: return false;
     }
 }
 
 /* Note a command that was sent. A datagram that feeds no deadman is in the mirror as it was received. */
-static void note_sent(struct actions *actions, const struct stage *stage, const struct targets *to,
+static void note_sent(struct actions *actions, const struct thread_env *env, const struct targets *to,
                       const struct target *target, const uint8_t *data, size_t size) {
     if (to->topic == NO_NAME && !target->feed_count) return;
     struct action_record action = {.action = ACTION_SENT, .route = to->route, .target = target->id, .topic = to->topic};
-    actions_note(actions, stage->counters, action, data, size);
+    actions_note(actions, env->counters, action, data, size);
 }
 
 /* Like `deliver_now`; part of `deliver`, where each instruction counts. */
-static inline bool leave(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+static inline bool leave(struct thread_env *env, const struct targets *to, const struct target *target, const uint8_t *data,
                          size_t size, int64_t expires, int64_t now) {
-    if (target->topic) return publish_it(stage, to, target, now);
-    int error = stage->send(stage, target, data, size, expires);
+    if (target->topic) return publish_it(env, to, target, now);
+    int error = env->send(env, target, data, size, expires);
     if (error) {
-        lose_unsent(stage, to, target, expires, now, error);
+        lose_unsent(env, to, target, expires, now, error);
     } else {
-        stage_count(stage, target->delivered, 1);
-        stage_count(stage, target->delivered_bytes, (int64_t)size);
-        struct actions *observed = stage_actions(stage);
-        if (observed) note_sent(observed, stage, to, target, data, size);
+        env_count(env, target->delivered, 1);
+        env_count(env, target->delivered_bytes, (int64_t)size);
+        struct actions *observed = env_actions(env);
+        if (observed) note_sent(observed, env, to, target, data, size);
     }
     return true;
 }
 
-bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+bool deliver_now(struct thread_env *env, const struct targets *to, const struct target *target, const uint8_t *data,
                  size_t size, int64_t expires, int64_t now) {
-    return leave(stage, to, target, data, size, expires, now);
+    return leave(env, to, target, data, size, expires, now);
 }
 
-bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message) {
-    struct delivery of = {.stage = stage, .to = to, .target = target, .message = message};
+bool deliver(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
+    struct delivery of = {.env = env, .to = to, .target = target, .message = message};
     bool is_forwarded = !target->message.count, has_condition = target->condition.count;
     of.expires = expiry(&of);
     if (!is_wanted(&of)) return true;
@@ -231,45 +231,45 @@ bool deliver(struct stage *stage, const struct targets *to, const struct target 
     if (!fits_board(&of)) return true;
     if (target->trims) of.size = trimmed_size(of.data, of.size);
     if (target->deferrals)
-        return defer(stage, target->deferrals[source_of(message)], of.data, of.size, of.expires, message->now);
-    return leave(stage, to, target, of.data, of.size, of.expires, message->now);
+        return defer(env, target->deferrals[source_of(message)], of.data, of.size, of.expires, message->now);
+    return leave(env, to, target, of.data, of.size, of.expires, message->now);
 }
 
-bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message) {
+bool deliver_to_all(struct thread_env *env, const struct targets *to, struct message *message) {
     for (uint32_t index = 0; index < to->count; index++)
-        if (!deliver(stage, to, &to->targets[index], message)) return false;
+        if (!deliver(env, to, &to->targets[index], message)) return false;
     return true;
 }
 
-/* ---- the stage of this computer ---- */
+/* ---- the environment of this computer ---- */
 
-static int64_t clock_now(struct stage *stage) {
-    (void)stage;
+static int64_t clock_now(struct thread_env *env) {
+    (void)env;
     return boottime_ns();
 }
 
 /* `deliver` has checked the age; it is checked again only after waiting for the lock of deadmen. */
-static int send_by_socket(struct stage *stage, const struct target *target, const uint8_t *data, size_t size,
+static int send_by_socket(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size,
                           int64_t expires) {
     if (!target->feed_count) return sender_send(target->sender, data, size);
-    return command_send(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
+    return command_send(env->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
 }
 
-static int brake_by_socket(struct stage *stage, const struct deadman_destination *to,
+static int brake_by_socket(struct thread_env *env, const struct deadman_destination *to,
                            const struct deadman_datagram *datagram) {
-    (void)stage;
+    (void)env;
     return sender_send_checked(to->sender, datagram->data, datagram->size);
 }
 
-bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers) {
-    memset(stage, 0, sizeof *stage);
-    stage->counters = counters;
-    stage->reporter.events = events;
-    stage->timers = timers;
-    stage->now = clock_now;
-    stage->send = send_by_socket;
-    stage->brake = brake_by_socket;
-    return machine_open(&stage->machine);
+bool env_open(struct thread_env *env, counter *counters, struct ring *events, struct timers *timers) {
+    memset(env, 0, sizeof *env);
+    env->counters = counters;
+    env->reporter.events = events;
+    env->timers = timers;
+    env->now = clock_now;
+    env->send = send_by_socket;
+    env->brake = brake_by_socket;
+    return machine_open(&env->machine);
 }
 
-void stage_close(struct stage *stage) { machine_close(&stage->machine); }
+void env_close(struct thread_env *env) { machine_close(&env->machine); }

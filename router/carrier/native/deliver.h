@@ -12,7 +12,7 @@
  *
  * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table requests.
  *
- * A stage provides the clock, sockets and middleware as functions, so that tests can replace them. */
+ * A thread environment provides the clock, sockets and middleware as functions, so that tests can replace them. */
 #ifndef DELIVER_H
 #define DELIVER_H
 
@@ -107,39 +107,39 @@ enum publication { PUBLISHED, PUBLISH_FAILED, ABANDONED };
 enum { BRAKE_LATER = -1 };
 
 /* The environment in which a thread delivers messages. */
-struct stage {
-    struct rehearsal *rehearsal; /* the owner of the functions in a rehearsal; NULL in operation */
+struct thread_env {
+    struct simulation *simulation; /* the owner of the functions in a simulation; NULL in operation */
     counter *counters;
     struct reporter reporter;
     struct timers *timers; /* the group of the deadmen that its commands feed */
     /* Called for each increment by a message or a deadman; NULL in operation. */
-    void (*counted)(struct stage *stage, uint32_t index, int64_t amount);
+    void (*counted)(struct thread_env *env, uint32_t index, int64_t amount);
     /* The boot clock, ns. */
-    int64_t (*now)(struct stage *stage);
+    int64_t (*now)(struct thread_env *env);
     /* Send as `command_send` does. The caller has just checked the age. */
-    int (*send)(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
+    int (*send)(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
     /* Send a datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
-    int (*brake)(struct stage *stage, const struct deadman_destination *to, const struct deadman_datagram *datagram);
+    int (*brake)(struct thread_env *env, const struct deadman_destination *to, const struct deadman_datagram *datagram);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. ABANDONED: the thread was
      * stuck in the middleware and has been abandoned: it must not use anything that belongs to others. */
-    enum publication (*publish)(struct stage *stage, const struct target *target, const char **why);
+    enum publication (*publish)(struct thread_env *env, const struct target *target, const char **why);
     struct machine machine; /* last, as it is large */
 };
 
-/* Prepare a stage with the clock and sockets of this computer; the caller sets `publish`. Return false if memory runs out.
- * Close the stage in either case. */
-bool stage_open(struct stage *stage, counter *counters, struct ring *events, struct timers *timers);
-void stage_close(struct stage *stage);
+/* Prepare an environment with the clock and sockets of this computer; the caller sets `publish`. Return false if memory runs out.
+ * Close it in either case. */
+bool env_open(struct thread_env *env, counter *counters, struct ring *events, struct timers *timers);
+void env_close(struct thread_env *env);
 
-/* Add to a counter of the stage. */
-static inline void stage_count(struct stage *stage, uint32_t index, int64_t amount) {
-    counter_add(stage->counters, index, amount);
-    if (stage->counted) stage->counted(stage, index, amount);
+/* Add to a counter of the environment. */
+static inline void env_count(struct thread_env *env, uint32_t index, int64_t amount) {
+    counter_add(env->counters, index, amount);
+    if (env->counted) env->counted(env, index, amount);
 }
 
-/* Where to note actions of the stage's thread; NULL while nobody observes. The stage must have a group of timers. */
-static inline struct actions *stage_actions(const struct stage *stage) {
-    return atomic_load_explicit(&stage->timers->actions, memory_order_acquire);
+/* Where to note actions of its thread; NULL while nobody observes. The environment must have a group of timers. */
+static inline struct actions *env_actions(const struct thread_env *env) {
+    return atomic_load_explicit(&env->timers->actions, memory_order_acquire);
 }
 
 /* Begin with a datagram: set the slots of its time and its sender, and the others to their defaults. `sources` are names of
@@ -152,25 +152,25 @@ bool read_datagram(struct machine *machine, const struct layout *layout, const s
                    const struct datagram *from);
 
 /* Count and report the loss of a message for a target. `lost` has the reason, and details if there are any. */
-void lose_message(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+void lose_message(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost, const char *text);
 
 /* Likewise for a message that the machine has refused. */
-void lose_refused(struct stage *stage, const struct targets *to, const struct target *target, int64_t now,
+void lose_refused(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now,
                   struct lost_event lost);
 
 /* Likewise for an expired message, older than `ttl`. `since` is the event that its age counts from. */
-void lose_stale(struct stage *stage, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
+void lose_stale(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
                 enum refused since);
 
 /* Send these bytes, or publish the machine's output, and count that. Return false if the thread was abandoned. */
-bool deliver_now(struct stage *stage, const struct targets *to, const struct target *target, const uint8_t *data,
+bool deliver_now(struct thread_env *env, const struct targets *to, const struct target *target, const uint8_t *data,
                  size_t size, int64_t expires, int64_t now);
 
 /* Deliver a message to one of the targets. Return false if the thread was abandoned. */
-bool deliver(struct stage *stage, const struct targets *to, const struct target *target, struct message *message);
+bool deliver(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message);
 
 /* Deliver a message to all targets. Return false if the thread was abandoned. */
-bool deliver_to_all(struct stage *stage, const struct targets *to, struct message *message);
+bool deliver_to_all(struct thread_env *env, const struct targets *to, struct message *message);
 
 #endif

@@ -160,7 +160,7 @@ static void from_ros_close(struct from_ros *thread) {
     if (thread->wake >= 0) close(thread->wake);
     pthread_cond_destroy(&thread->changed);
     pthread_mutex_destroy(&thread->lock);
-    stage_close(&thread->routing.stage);
+    env_close(&thread->routing.env);
     free(thread->message.buffer);
     free(thread);
 }
@@ -177,7 +177,7 @@ struct from_ros *from_ros_open(struct timers *timers, counter *counters, struct 
     condition_open(&thread->changed);
     thread->epoll = epoll_create1(EPOLL_CLOEXEC);
     thread->wake = eventfd(0, EFD_CLOEXEC);
-    bool is_open = stage_open(&thread->routing.stage, counters, events, timers);
+    bool is_open = env_open(&thread->routing.env, counters, events, timers);
     if (!is_open || thread->epoll < 0 || thread->wake < 0 || from_ros_watch(thread, thread->wake) ||
         thread_start(&thread->thread, is_urgent ? "ros urgent" : "ros messages", run, thread)) {
         from_ros_close(thread);
@@ -231,5 +231,5 @@ uint64_t from_ros_failures(struct from_ros *thread) {
 }
 
 bool from_ros_counters(struct from_ros *thread, int64_t *to, uint32_t count) {
-    return counters_copy(&thread->edition, thread->routing.stage.counters, to, count);
+    return counters_copy(&thread->edition, thread->routing.env.counters, to, count);
 }

@@ -114,12 +114,12 @@ static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *
     const struct route_target *of = first->of;
     if (first->expires == SUPERSEDED) return false;
     if (now > first->expires) {
-        lose_stale(timers->stage, of->to, of->target, now, first->expires, REFUSED_WAITING);
+        lose_stale(timers->env, of->to, of->target, now, first->expires, REFUSED_WAITING);
         return false;
     }
     pacer->paid_at += first->cost;
     timers->arrived = first->arrived;
-    deliver_now(timers->stage, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);
+    deliver_now(timers->env, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);
     timers->arrived = NEVER;
     return true;
 }
@@ -147,7 +147,7 @@ static void drop_one(struct timers *timers, struct pacer *pacer, int64_t now) {
     const struct waiting_datagram *oldest = take_off(pacer, &pacer->lanes[lowest]);
     const struct route_target *of = oldest->of;
     if (oldest->expires == SUPERSEDED) return;
-    lose_message(timers->stage, of->to, of->target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
+    lose_message(timers->env, of->to, of->target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
 }
 
 /* ---- the timer ---- */
@@ -182,7 +182,7 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target
     int64_t arrived = timers->arrived == NEVER ? now : timers->arrived;
     struct waiting_datagram waiting = {of, expires, arrived, cost_of(pacer, size), size};
     if (pacer->has_ended) {
-        deliver_now(timers->stage, of->to, of->target, data, size, expires, now);
+        deliver_now(timers->env, of->to, of->target, data, size, expires, now);
         return;
     }
     limit_savings(pacer, now);
@@ -221,14 +221,14 @@ void pacer_supersede(struct timers *timers, struct pacer *pacer, const struct ro
             at += whole_size(waiting->size);
             if (waiting->of != of || waiting->expires == SUPERSEDED || waiting->arrived > timers->arrived) continue;
             waiting->expires = SUPERSEDED;
-            lose_superseded(timers->stage, of, now);
+            lose_superseded(timers->env, of, now);
         }
     }
     timer_set_due(timers, &pacer->timer, now);
 }
 
-void lose_superseded(struct stage *stage, const struct route_target *of, int64_t now) {
-    lose_message(stage, of->to, of->target, now, (struct lost_event){.reason = DROP_SUPERSEDED}, "");
+void lose_superseded(struct thread_env *env, const struct route_target *of, int64_t now) {
+    lose_message(env, of->to, of->target, now, (struct lost_event){.reason = DROP_SUPERSEDED}, "");
 }
 
 struct pacer *pacer_open(int64_t bandwidth) {

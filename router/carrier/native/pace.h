@@ -46,6 +46,6 @@ void pacer_queue(struct timers *timers, struct pacer *pacer, struct route_target
 void pacer_release(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);
 void pacer_supersede(struct timers *timers, struct pacer *pacer, const struct route_target *of, int64_t now);
 
-void lose_superseded(struct stage *stage, const struct route_target *of, int64_t now);
+void lose_superseded(struct thread_env *env, const struct route_target *of, int64_t now);
 
 #endif

@@ -11,7 +11,7 @@
 #include "threads.h"
 
 struct publish_thread {
-    struct stage stage; /* first: its functions get a pointer to it */
+    struct thread_env env; /* first: its functions get a pointer to it */
     pthread_t thread;
     pthread_mutex_t lock; /* held by the thread, except while it waits or is in the middleware */
     pthread_cond_t changed;
@@ -31,10 +31,10 @@ struct publish_thread {
 /* ---- the middleware ---- */
 
 /* Publish the written message, without the lock. The counters balance meanwhile, as the message counts as waiting. */
-static enum publication publish_written(struct stage *stage, const struct target *target, const char **why) {
-    struct publish_thread *thread = (struct publish_thread *)stage;
+static enum publication publish_written(struct thread_env *env, const struct target *target, const char **why) {
+    struct publish_thread *thread = (struct publish_thread *)env;
     edition_end(&thread->edition);
-    *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &stage->machine.output);
+    *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &env->machine.output);
     edition_begin(&thread->edition);
     return thread->is_abandoned ? ABANDONED : *why ? PUBLISH_FAILED : PUBLISHED;
 }
@@ -43,7 +43,7 @@ static enum publication publish_written(struct stage *stage, const struct target
 
 /* How long to wait for messages, in ns: until the next timer is due, or forever (-1). */
 static int64_t patience_of(const struct publish_thread *thread) {
-    int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&thread->env.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return -1;
     int64_t wait = due - boottime_ns();
     return wait > 0 ? wait : 0;
@@ -59,12 +59,12 @@ static size_t take(struct publish_thread *thread, bool waits) {
 }
 
 static void serve_timers(struct publish_thread *thread) {
-    int64_t due = atomic_load_explicit(&thread->stage.timers->wakes_at, memory_order_relaxed);
+    int64_t due = atomic_load_explicit(&thread->env.timers->wakes_at, memory_order_relaxed);
     if (due == NEVER) return;
-    int64_t now = thread->stage.now(&thread->stage);
+    int64_t now = thread->env.now(&thread->env);
     if (now < due) return;
     edition_begin(&thread->edition);
-    timers_serve(thread->stage.timers, now);
+    timers_serve(thread->env.timers, now);
     edition_end(&thread->edition);
 }
 
@@ -75,7 +75,7 @@ static void reach(struct publish_thread *thread, uint32_t generation) {
         const struct publish_change *change = thread->changes;
         thread->changes = change->next;
         edition_begin(&thread->edition);
-        timers_change(thread->stage.timers, &change->timers);
+        timers_change(thread->env.timers, &change->timers);
         edition_end(&thread->edition);
     }
     atomic_store(&thread->generation, generation);
@@ -88,7 +88,7 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
         reach(thread, record->generation);
         if (thread->is_abandoned) return false;
         edition_begin(&thread->edition);
-        bool goes_on = route_to_topics(&thread->stage, record);
+        bool goes_on = route_to_topics(&thread->env, record);
         edition_end(&thread->edition);
         if (!goes_on) return false;
         serve_timers(thread);
@@ -101,7 +101,7 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
 /* Settle the timers. */
 static void end_timers(struct publish_thread *thread) {
     edition_begin(&thread->edition);
-    timers_end(thread->stage.timers);
+    timers_end(thread->env.timers);
     edition_end(&thread->edition);
 }
 
@@ -132,8 +132,8 @@ static void *run(void *of) {
 static void publish_close(struct publish_thread *thread) {
     pthread_cond_destroy(&thread->changed);
     pthread_mutex_destroy(&thread->lock);
-    if (thread->stage.timers) timers_close(thread->stage.timers);
-    stage_close(&thread->stage);
+    if (thread->env.timers) timers_close(thread->env.timers);
+    env_close(&thread->env);
     free(thread);
 }
 
@@ -150,10 +150,10 @@ static struct publish_thread *publish_prepare(struct ring *ring, counter *counte
     thread->publishing.reset = reset;
     pthread_mutex_init(&thread->lock, NULL);
     condition_open(&thread->changed);
-    bool is_open = stage_open(&thread->stage, counters, events, NULL);
-    thread->stage.publish = publish_written;
-    thread->stage.timers = timers_open_on(&thread->stage, false);
-    if (is_open && thread->stage.timers) return thread;
+    bool is_open = env_open(&thread->env, counters, events, NULL);
+    thread->env.publish = publish_written;
+    thread->env.timers = timers_open_on(&thread->env, false);
+    if (is_open && thread->env.timers) return thread;
     publish_close(thread);
     return NULL;
 }
@@ -197,5 +197,5 @@ bool publish_stop(struct publish_thread *thread) {
 }
 
 bool publish_counters(struct publish_thread *thread, int64_t *to, uint32_t count) {
-    return counters_copy(&thread->edition, thread->stage.counters, to, count);
+    return counters_copy(&thread->edition, thread->env.counters, to, count);
 }

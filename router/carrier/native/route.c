@@ -9,7 +9,7 @@
 /* ---- events ---- */
 
 static void report(struct routing *routing, const struct received *received, struct datagram_event about) {
-    if (!may_report(&routing->stage.reporter, received->now)) return;
+    if (!may_report(&routing->env.reporter, received->now)) return;
     struct datagram_event *event = (struct datagram_event *)routing->record;
     size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
     *event = about;
@@ -19,19 +19,19 @@ static void report(struct routing *routing, const struct received *received, str
     event->port = received->port;
     event->length = (uint32_t)received->length;
     memcpy(event + 1, routing->datagram, kept);
-    ring_put(routing->stage.reporter.events, event, event->size);
+    ring_put(routing->env.reporter.events, event, event->size);
 }
 
 static void reject(struct routing *routing, const struct received *received, enum reason reason) {
     const struct listener *listener = received->listener;
     struct datagram_event event = {.kind = EVENT_REJECTED, .reason = reason, .counter = listener->rejected[reason]};
-    stage_count(&routing->stage, event.counter, 1);
+    env_count(&routing->env, event.counter, 1);
     if (reason != IGNORED) report(routing, received, event);
 }
 
 static void report_superseded(struct routing *routing, const struct received *received) {
     struct datagram_event event = {.kind = EVENT_SUPERSEDED, .counter = received->listener->superseded};
-    stage_count(&routing->stage, event.counter, received->envelope.superseded);
+    env_count(&routing->env, event.counter, received->envelope.superseded);
     report(routing, received, event);
 }
 
@@ -48,7 +48,7 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
     struct datagram datagram = datagram_of(routing, received);
     struct message message = {.datagram = &datagram, .now = received->now, .times = received->times,
                               .since = REFUSED_ARRIVAL};
-    deliver_to_all(&routing->stage, to, &message);
+    deliver_to_all(&routing->env, to, &message);
 }
 
 static bool is_wanted(const struct targets *to) {
@@ -63,8 +63,8 @@ static void drop_oldest(struct routing *routing, int64_t now) {
     if (!ring_drop(routing->published, &oldest, sizeof oldest)) return;
     for (uint32_t index = 0; index < oldest.to->count; index++) {
         const struct target *target = &oldest.to->targets[index];
-        stage_count(&routing->stage, target->waiting, -1);
-        lose_message(&routing->stage, oldest.to, target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
+        env_count(&routing->env, target->waiting, -1);
+        lose_message(&routing->env, oldest.to, target, now, (struct lost_event){.reason = DROP_QUEUE_FULL}, "");
     }
 }
 
@@ -72,7 +72,7 @@ static void drop_oldest(struct routing *routing, int64_t now) {
 static void hand_over(struct routing *routing, const struct targets *to, const struct received *received) {
     if (!is_wanted(to)) {
         for (uint32_t index = 0; index < to->count; index++)
-            stage_count(&routing->stage, to->targets[index].filtered, 1);
+            env_count(&routing->env, to->targets[index].filtered, 1);
         return;
     }
     struct message_record *record = (struct message_record *)routing->record;
@@ -90,7 +90,7 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
                                       .payload_length = received->envelope.length};
     memcpy(record + 1, routing->datagram, received->envelope.size);
     for (uint32_t index = 0; index < to->count; index++)
-        stage_count(&routing->stage, to->targets[index].waiting, 1);
+        env_count(&routing->env, to->targets[index].waiting, 1);
     while (!ring_put(routing->published, record, record->size)) drop_oldest(routing, received->now);
 }
 
@@ -110,7 +110,7 @@ static void report_evidence(struct routing *routing, const struct witness *witne
                                    .deadman = witness->deadman_id, .destination = witness->endpoint_id,
                                    .after = datagram->size};
     memcpy(event + 1, datagram->data, datagram->size);
-    ring_put(routing->stage.reporter.events, event, event->size);
+    ring_put(routing->env.reporter.events, event, event->size);
 }
 
 /* Show the datagram to deadmen that send to its sender. A condition without a result is not met. */
@@ -119,8 +119,8 @@ static void show_to_deadmen(struct routing *routing, const struct route *route, 
     for (uint32_t index = 0; index < route->witness_count; index++) {
         const struct witness *witness = &route->witnesses[index];
         if (witness->column != received->column || !deadman_is_tripped(witness->deadman)) continue;
-        bool obeys = meets_condition(&routing->stage.machine, witness, &datagram);
-        if (deadman_is_shown(routing->stage.timers, witness->deadman, witness->endpoint_id, obeys, received->times.oldest))
+        bool obeys = meets_condition(&routing->env.machine, witness, &datagram);
+        if (deadman_is_shown(routing->env.timers, witness->deadman, witness->endpoint_id, obeys, received->times.oldest))
             report_evidence(routing, witness, &datagram);
     }
 }
@@ -158,18 +158,18 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     const struct listener *listener = received->listener;
     if (found->row < 0) {
         if (found->is_ignored) return IGNORED;
-        stage_count(&routing->stage, found->unhandled, 1);
+        env_count(&routing->env, found->unhandled, 1);
         return UNHANDLED;
     }
     const struct choice *choice = &listener->choices[(uint32_t)found->row * listener->columns + received->column];
     if (choice->route < 0) return SOURCE_MISMATCH;
     const struct route *chosen = &program->routes[choice->route];
     received->route = chosen;
-    stage_count(&routing->stage, choice->received, 1);
+    env_count(&routing->env, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
     if (chosen->witness_count) show_to_deadmen(routing, chosen, received);
-    counter_set(routing->stage.counters, chosen->last_message, received->now);
+    counter_set(routing->env.counters, chosen->last_message, received->now);
     return ROUTED;
 }
 
@@ -179,24 +179,24 @@ static int route(struct routing *routing, const struct payload_case *found, stru
  * is its rhythm, not a silence. */
 static void end_silence(struct routing *routing, const struct received *received, int64_t before) {
     const struct peer *peer = received->peer;
-    counter *counters = routing->stage.counters;
+    counter *counters = routing->env.counters;
     int64_t heard_since = atomic_load_explicit(&counters[peer->heard_since], memory_order_relaxed);
     int64_t silence = received->now - before;
     counter_set(counters, peer->heard_since, received->now);
     if (!before || before - heard_since < silence) return;
-    stage_count(&routing->stage, peer->silences, 1);
+    env_count(&routing->env, peer->silences, 1);
     counter_set(counters, peer->last_silence, silence);
-    struct actions *observed = stage_actions(&routing->stage);
+    struct actions *observed = env_actions(&routing->env);
     struct action_record action = {.action = ACTION_RETURNED, .route = NO_NAME, .target = peer->id, .topic = NO_NAME};
     if (observed) actions_note(observed, counters, action, &silence, sizeof silence);
     struct returned_event event = {.kind = EVENT_RETURNED, .endpoint = peer->id, .silence = silence};
-    if (may_report(&routing->stage.reporter, received->now))
-        put_event(routing->stage.reporter.events, &event, sizeof event, "");
+    if (may_report(&routing->env.reporter, received->now))
+        put_event(routing->env.reporter.events, &event, sizeof event, "");
 }
 
 static void hear(struct routing *routing, const struct received *received) {
     const struct peer *peer = received->peer;
-    counter *last_seen = &routing->stage.counters[peer->last_seen];
+    counter *last_seen = &routing->env.counters[peer->last_seen];
     int64_t before = atomic_load_explicit(last_seen, memory_order_relaxed);
     atomic_store_explicit(last_seen, received->now, memory_order_relaxed);
     if (!before || received->now - before > peer->pause) end_silence(routing, received, before);
@@ -208,17 +208,17 @@ int route_datagram(struct routing *routing, struct received *received) {
     const struct listener *listener = received->listener;
     int64_t arrived_at = received->arrived_at ? received->arrived_at : received->received_at;
     received->times = freshness_times(&routing->freshness, arrived_at, received->received_at, received->now, INT64_MIN);
-    stage_count(&routing->stage, listener->received, 1);
-    stage_count(&routing->stage, listener->received_bytes, (int64_t)received->length);
+    env_count(&routing->env, listener->received, 1);
+    env_count(&routing->env, listener->received_bytes, (int64_t)received->length);
     received->peer = find_peer(listener, received->address, received->port);
     received->column = received->peer ? received->peer->column : listener->columns - 1;
     received->route = NULL;
     if (received->peer) hear(routing, received);
     int reason = envelope_read(routing->program->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
-    if (received->envelope.is_repaired) stage_count(&routing->stage, listener->padded, 1);
+    if (received->envelope.is_repaired) env_count(&routing->env, listener->padded, 1);
     if (received->envelope.superseded) report_superseded(routing, received);
-    if (reason == UNKNOWN_CASE) stage_count(&routing->stage, routing->program->unknown_case, 1);
+    if (reason == UNKNOWN_CASE) env_count(&routing->env, routing->program->unknown_case, 1);
     if (reason == ROUTED) reason = route(routing, find_case(routing->program, received->envelope.case_number), received);
     if (reason != ROUTED) reject(routing, received, (enum reason)reason);
     return reason;
@@ -226,22 +226,22 @@ int route_datagram(struct routing *routing, struct received *received) {
 
 void routing_adopt(struct routing *routing, const struct change *change) {
     for (uint32_t index = 0; index < change->replaced_count; index++)
-        deadman_replace(routing->stage.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
-    timers_change(routing->stage.timers, &change->timers);
+        deadman_replace(routing->env.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
+    timers_change(routing->env.timers, &change->timers);
     routing->program = change->program;
 }
 
-bool route_to_topics(struct stage *stage, const struct message_record *record) {
+bool route_to_topics(struct thread_env *env, const struct message_record *record) {
     const struct targets *to = record->to;
     struct datagram datagram = {.data = (const uint8_t *)(record + 1), .size = record->length, .start = record->start,
                                 .length = record->payload_length, .is_single = record->is_single,
                                 .column = record->column, .received_at = record->received_at};
     struct message message = {.datagram = &datagram, .now = record->now, .times = {record->oldest, record->youngest},
                               .since = REFUSED_ARRIVAL};
-    bool is_delivered = !to->collect || collect(stage, to, &message);
+    bool is_delivered = !to->collect || collect(env, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {
-        if (is_delivered && !deliver(stage, to, &to->targets[index], &message)) return false;
-        stage_count(stage, to->targets[index].waiting, -1);
+        if (is_delivered && !deliver(env, to, &to->targets[index], &message)) return false;
+        env_count(env, to->targets[index].waiting, -1);
     }
     return true;
 }

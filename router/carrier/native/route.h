@@ -1,7 +1,7 @@
 /* Routes a received datagram, sends it to the destinations of its route, and passes it to the thread that serves the route's
  * topics, through a ring.
  *
- * The callers provide sockets, threads and clocks: carrier.c, publish.c, and rehearsal.c, which simulates them. */
+ * The callers provide sockets, threads and clocks: carrier.c, publish.c, and simulation.c, which simulates them. */
 #ifndef ROUTE_H
 #define ROUTE_H
 
@@ -16,7 +16,7 @@
 
 /* The environment of a thread that routes datagrams. */
 struct routing {
-    struct stage stage; /* first: its functions get a pointer to it */
+    struct thread_env env; /* first: its functions get a pointer to it */
     const struct program *program;
     struct freshness freshness;
     struct ring *published; /* messages for topics */
@@ -51,6 +51,6 @@ int route_datagram(struct routing *routing, struct received *received);
 void routing_adopt(struct routing *routing, const struct change *change);
 
 /* Deliver a message that `route_datagram` has put into the ring. Return false if the thread has been abandoned. */
-bool route_to_topics(struct stage *stage, const struct message_record *record);
+bool route_to_topics(struct thread_env *env, const struct message_record *record);
 
 #endif

@@ -33,7 +33,7 @@ static struct time_range sent(struct ros_routing *routing, const struct taken *t
 static void date_by_stamp(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken,
                           struct message *message) {
     if (route->seconds == NONE) return;
-    const struct value *slots = routing->stage.machine.slots;
+    const struct value *slots = routing->env.machine.slots;
     int64_t stamp = slots[route->seconds].integer * 1000000000 + slots[route->nanoseconds].integer;
     if (!stamp) return;
     struct time_range stamped = freshness_times(&routing->freshness, stamp, taken->received_at, taken->now,
@@ -48,21 +48,21 @@ static void date_by_stamp(struct ros_routing *routing, const struct ros_route *r
 /* Remove an element from a list, and deliver it. Its cells are freed afterwards. */
 static void serve_element(struct ros_routing *routing, const struct ros_route *route, struct message message,
                           struct value *list, int64_t index) {
-    struct machine *machine = &routing->stage.machine;
+    struct machine *machine = &routing->env.machine;
     const struct for_each *each = &route->for_each;
     uint32_t cell_count = machine->cell_count;
     struct value item = list_next(machine, list, each->stored);
     if (each->index != NONE) machine->slots[each->index].integer = index;
     if (each->section == NONE) machine->slots[each->item] = item;
     else if (!machine_enter(machine, each->section, &item)) message.outcome = DROP_MAPPING_ERROR;
-    deliver_to_all(&routing->stage, &route->targets, &message);
+    deliver_to_all(&routing->env, &route->targets, &message);
     machine->cell_count = cell_count;
 }
 
 /* Deliver each element of the list of `for_each`. Return their number. A list that is refused or too long counts as one
  * message. */
 static int64_t serve_each(struct ros_routing *routing, const struct ros_route *route, struct message *message) {
-    struct machine *machine = &routing->stage.machine;
+    struct machine *machine = &routing->env.machine;
     struct value list;
     uint32_t at;
     message->place = PLACE_ROUTE;
@@ -72,7 +72,7 @@ static int64_t serve_each(struct ros_routing *routing, const struct ros_route *r
         message->outcome = DROP_MAPPING_ERROR;
     }
     if (message->outcome != EVALUATED) {
-        deliver_to_all(&routing->stage, &route->targets, message);
+        deliver_to_all(&routing->env, &route->targets, message);
         return 1;
     }
     int64_t count = list.size;
@@ -111,7 +111,7 @@ void follow_publisher(struct ros_routing *routing, const struct ros_publisher *k
 void route_ros(struct ros_routing *routing, const struct ros_route *route, const struct taken *taken) {
     struct message message = {.now = taken->now, .is_read = true, .outcome = EVALUATED,
                               .since = taken->published_at ? REFUSED_SENDING : REFUSED_ARRIVAL};
-    struct machine *machine = &routing->stage.machine;
+    struct machine *machine = &routing->env.machine;
     int64_t count = 1;
     if (route->targets.ttl) message.times = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
@@ -119,16 +119,16 @@ void route_ros(struct ros_routing *routing, const struct ros_route *route, const
     if (!machine_read(machine, taken->data, taken->size)) message.outcome = DROP_MAPPING_ERROR;
     else if (route->targets.ttl) date_by_stamp(routing, route, taken, &message);
     if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
-    else deliver_to_all(&routing->stage, &route->targets, &message);
-    stage_count(&routing->stage, route->received, count);
+    else deliver_to_all(&routing->env, &route->targets, &message);
+    env_count(&routing->env, route->received, count);
 }
 
 void route_ros_message(struct ros_routing *routing, const struct ros_topic *topic, const struct taken *taken) {
-    struct stage *stage = &routing->stage;
+    struct thread_env *env = &routing->env;
     for (uint32_t index = 0; index < topic->route_count; index++) {
         const struct ros_route *route = &topic->routes[index];
         route_ros(routing, route, taken);
-        counter_set(stage->counters, route->last_message, taken->now);
-        count_duration(stage->counters, route->duration, LATENCY, stage->now(stage) - taken->now);
+        counter_set(env->counters, route->last_message, taken->now);
+        count_duration(env->counters, route->duration, LATENCY, env->now(env) - taken->now);
     }
 }

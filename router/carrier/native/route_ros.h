@@ -1,6 +1,6 @@
 /* Routes a message from ROS: each route of its topic delivers it, or each element of one of its lists.
  *
- * The callers provide threads, middleware and clocks: from_ros.c, and rehearsal.c, which simulates them. */
+ * The callers provide threads, middleware and clocks: from_ros.c, and simulation.c, which simulates them. */
 #ifndef ROUTE_ROS_H
 #define ROUTE_ROS_H
 
@@ -56,7 +56,7 @@ struct ros_publisher {
 
 /* The environment of a thread that routes messages from ROS. */
 struct ros_routing {
-    struct stage stage; /* first: its functions get a pointer to it */
+    struct thread_env env; /* first: its functions get a pointer to it */
     struct freshness freshness;
     struct ros_publisher publishers[MOST_PUBLISHERS];
 };

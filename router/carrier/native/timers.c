@@ -18,7 +18,7 @@ int lock_open(pthread_mutex_t *lock) {
     return error;
 }
 
-struct timers *timers_open_on(struct stage *stage, bool has_timer) {
+struct timers *timers_open_on(struct thread_env *env, bool has_timer) {
     struct timers *timers = calloc(1, sizeof *timers);
     if (!timers) return NULL;
     timers->timer = has_timer ? timerfd_create(CLOCK_BOOTTIME, TFD_CLOEXEC | TFD_NONBLOCK) : -1;
@@ -27,38 +27,38 @@ struct timers *timers_open_on(struct stage *stage, bool has_timer) {
         free(timers);
         return NULL;
     }
-    timers->stage = stage;
+    timers->env = env;
     timers->wakes_at = timers->arrived = NEVER;
     return timers;
 }
 
 /* Send a command while the lock is held. */
-static int send_locked(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
-    int64_t now = stage->now(stage);
-    return command_send_at(stage->timers, target->sender, data, size, expires, target->feeds, target->feed_count, now);
+static int send_locked(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    int64_t now = env->now(env);
+    return command_send_at(env->timers, target->sender, data, size, expires, target->feeds, target->feed_count, now);
 }
 
 struct timers *timers_open(counter *counters, struct ring *events) {
-    struct stage *stage = calloc(1, sizeof *stage);
-    if (!stage) return NULL;
-    struct timers *timers = stage_open(stage, counters, events, NULL) ? timers_open_on(stage, true) : NULL;
+    struct thread_env *env = calloc(1, sizeof *env);
+    if (!env) return NULL;
+    struct timers *timers = env_open(env, counters, events, NULL) ? timers_open_on(env, true) : NULL;
     if (!timers) {
-        stage_close(stage);
-        free(stage);
+        env_close(env);
+        free(env);
         return NULL;
     }
-    stage->timers = timers;
-    stage->send = send_locked;
-    timers->has_own_stage = true;
+    env->timers = timers;
+    env->send = send_locked;
+    timers->has_own_env = true;
     return timers;
 }
 
 void timers_close(struct timers *timers) {
     pthread_mutex_destroy(&timers->lock);
     if (timers->timer >= 0) close(timers->timer);
-    if (timers->has_own_stage) {
-        stage_close(timers->stage);
-        free(timers->stage);
+    if (timers->has_own_env) {
+        env_close(timers->env);
+        free(timers->env);
     }
     free(timers);
 }
@@ -127,7 +127,7 @@ void timers_serve(struct timers *timers, int64_t now) {
 
 void timers_change(struct timers *timers, const struct timer_change *change) {
     pthread_mutex_lock(&timers->lock);
-    int64_t now = timers->stage->now(timers->stage);
+    int64_t now = timers->env->now(timers->env);
     for (uint32_t index = 0; index < change->ended_count && !timers->is_abandoned; index++) {
         struct timer *timer = change->ended[index];
         timer->kind->end(timers, timer, now);
@@ -145,7 +145,7 @@ void timer_end(struct timers *timers, struct timer *timer) {
 
 void timers_end(struct timers *timers) {
     pthread_mutex_lock(&timers->lock);
-    int64_t now = timers->stage->now(timers->stage);
+    int64_t now = timers->env->now(timers->env);
     end_all(timers, false, now);
     end_all(timers, true, now);
     pthread_mutex_unlock(&timers->lock);

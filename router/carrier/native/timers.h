@@ -17,7 +17,7 @@
 
 #define NEVER INT64_MAX
 
-struct stage;
+struct thread_env;
 struct target;
 struct targets;
 struct timer;
@@ -42,11 +42,11 @@ struct timer {
     int64_t due; /* boot clock, ns, or NEVER. Changed by `timer_set_due` */
 };
 
-/* A group. Its stage sends and counts the messages of the timers. */
+/* A group. Its environment sends and counts the messages of the timers. */
 struct timers {
     pthread_mutex_t lock;
-    struct stage *stage;
-    bool has_own_stage;
+    struct thread_env *env;
+    bool has_own_env;
     int64_t arrived;   /* when the message that is being delivered arrived, if it was held or queued; otherwise NEVER */
     bool is_abandoned; /* publishing returned ABANDONED: use nothing that belongs to others */
     const counter *heard; /* of the thread that receives: when endpoints were heard; NULL if none does */
@@ -58,13 +58,13 @@ struct timers {
     struct timer *first, *last; /* newest first: deferrals are served before the pacer that gets their messages */
 };
 
-/* Open a group with a stage of its own, for this computer. It counts in `counters` and writes to `events`, which may be
+/* Open a group with an environment of its own, for this computer. It counts in `counters` and writes to `events`, which may be
  * NULL, under the lock and as the only writer. */
 struct timers *timers_open(counter *counters, struct ring *events);
 
-/* Open a group that uses a stage of the caller under the lock, with a timerfd or without. Both return NULL if memory or
+/* Open a group that uses an environment of the caller under the lock, with a timerfd or without. Both return NULL if memory or
  * descriptors run out. */
-struct timers *timers_open_on(struct stage *stage, bool has_timer);
+struct timers *timers_open_on(struct thread_env *env, bool has_timer);
 void timers_close(struct timers *timers); /* when no thread uses it and it has no timer left */
 
 /* Note the actions of the threads that use the group from now on; NULL stops that. Takes no lock. */

@@ -13,7 +13,7 @@ from router.compiler.lowering.lists import LoopList
 from router.compiler.lowering.messages import Place, Placed, at, loop, lower_lists, merged
 from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.offsets import HIGHEST, Offset
-from router.compiler.lowering.operations import Operation, keep, known, load
+from router.compiler.lowering.operations import Operation, known, load, store
 from router.compiler.lowering.sections import size_of
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op, Scalar
@@ -69,7 +69,7 @@ class _Writer:
         slot = self.lowering.names.temporary()
         number = at(place, count)
         if plan.type.length is None:
-            number += at(place, keep(slot), Operation(Op.PUT, 4), load(slot))
+            number += at(place, store(slot), Operation(Op.PUT, 4), load(slot))
         if _are_copied(plan, inputs):
             (_, _, octets), *_ = inputs
             return [*number, *at(place, Operation(Op.DROP), load(octets), Operation(Op.PUT_BYTES))]

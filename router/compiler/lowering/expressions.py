@@ -33,11 +33,11 @@ from router.compiler.lowering.operations import (
     chained,
     choice,
     integer,
-    keep,
     load,
     once,
     real,
     routine,
+    store,
     text,
 )
 from router.compiler.lowering.sections import Section
@@ -206,14 +206,14 @@ class Lowering:
         kind = node.left.kind
         again = load(slot), Operation(multiply, flag=signs(kind, kind, kind))
         last = load(slot), Operation(multiply, flag=signs(node.kind, kind, kind))
-        return routine(base, keep(slot), again * (exponent - 2), last)
+        return routine(base, store(slot), again * (exponent - 2), last)
 
     def _compare(self, node: tree.Compare) -> Routine:
         """Lower comparisons. Each operand is evaluated once; evaluation stops at a comparison that is false."""
         slots = [self.names.temporary() for _ in node.operands[1:-1]]
         values = list(map(self.value, node.operands))
         firsts = [values[0], *((load(slot),) for slot in slots)]
-        seconds = [*(routine(value, keep(slot)) for value, slot in zip(values[1:], slots, strict=False)), values[-1]]
+        seconds = [*(routine(value, store(slot)) for value, slot in zip(values[1:], slots, strict=False)), values[-1]]
         kinds = pairwise(operand.kind for operand in node.operands)
         parts = [
             compare(relation, first, second, *both)

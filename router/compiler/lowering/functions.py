@@ -19,7 +19,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.lowering import lists
 from router.compiler.lowering.numbers import bounds, fitted, is_unsigned, signs, to_real
-from router.compiler.lowering.operations import DROP, Operation, Routine, integer, keep, load, real, routine, text
+from router.compiler.lowering.operations import DROP, Operation, Routine, integer, load, real, routine, store, text
 from router.declared import MAX_DATAGRAM, Compared, Op, Relation
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _named(lowering: Lowering, node: tree.Call) -> Routine:
         numbers = routine(
             is_it, Operation(Op.UNLESS, size=2), integer(number), Operation(Op.JUMP, size=len(numbers)), numbers
         )
-    return routine(lowering.value(node.arguments[0]), keep(slot), DROP, numbers)
+    return routine(lowering.value(node.arguments[0]), store(slot), DROP, numbers)
 
 
 def _member(lowering: Lowering, node: tree.Call) -> Routine:

@@ -32,11 +32,11 @@ from router.compiler.lowering.operations import (
     Slot,
     choice,
     integer,
-    keep,
     load,
     real,
     repeat,
     routine,
+    store,
 )
 from router.compiler.lowering.sections import Section
 from router.declared import Op, Scalar
@@ -132,7 +132,7 @@ def _listed(lowering: Lowering, node: tree.ListLiteral) -> StoredList:
 
 def _empty_list(slot: Slot) -> Routine:
     """Return the operations that put an empty list into a slot."""
-    return Operation(Op.LIST, size=0), keep(slot), DROP
+    return Operation(Op.LIST, size=0), store(slot), DROP
 
 
 def _as(kind: Kind, element: Kind | None) -> tuple[Operation, ...]:
@@ -178,7 +178,7 @@ def _with_elements(lowering: Lowering, values: StoredList, element: Kind) -> Sto
     if kind is None or not (is_moment or values.is_unchecked or _as(kind, element)):
         return replace(values, element=element)
     filled, element_slot = lowering.names.temporary(), lowering.names.temporary()
-    start = routine(_empty_list(filled), values.routine, keep(element_slot), SIZE)
+    start = routine(_empty_list(filled), values.routine, store(element_slot), SIZE)
     taken, meaning = _take_element(lowering, values, element_slot)
     one = lowering.time((), meaning) if isinstance(meaning, Section) else ()
     body = routine(taken, one, *_as(kind, element), Operation(Op.APPEND, filled))
@@ -211,7 +211,7 @@ def lower_lists(lowering: Lowering, lists: Sequence[tuple[str, tree.Node]]) -> t
     for variable, values in lists:
         of = lower_list(lowering, values)
         slot = lowering.names.temporary()
-        count = routine(count, of.routine, keep(slot), SIZE)
+        count = routine(count, of.routine, store(slot), SIZE)
         if inputs:
             count = routine(count, Operation(Op.SAME_COUNT))
         inputs.append((variable, of, slot))
@@ -225,12 +225,12 @@ def loop_body(lowering: Lowering, inputs: Sequence[LoopList], body: Callable[[],
         one, section = _take_element(lowering, of, slot)
         meaning = section or lowering.names.temporary()
         lowering.names.variables[variable] = meaning
-        before = routine(before, one) if isinstance(meaning, Section) else routine(before, one, keep(meaning), DROP)
+        before = routine(before, one) if isinstance(meaning, Section) else routine(before, one, store(meaning), DROP)
     loop = Loop(frozenset(variable for variable, _, _ in inputs))
     lowering.names.loops.append(loop)
     turn = _elide_slot(routine(before, body()))
     lowering.names.loops.pop()
-    return routine(*((integer(0), keep(flag), DROP) for flag in loop.flags)), turn
+    return routine(*((integer(0), store(flag), DROP) for flag in loop.flags)), turn
 
 
 def _take_element(lowering: Lowering, of: StoredList, slot: Slot) -> tuple[Routine, Section | None]:
@@ -281,7 +281,7 @@ def checked_list(lowering: Lowering, node: tree.Node) -> StoredList:
         return of
     slot = lowering.names.temporary()
     body = Operation(Op.NEXT, slot, flag=of.scalar), Operation(Op.UTF8), DROP
-    return replace(of, routine=routine(of.routine, keep(slot), SIZE, repeat(body), of.routine), is_unchecked=False)
+    return replace(of, routine=routine(of.routine, store(slot), SIZE, repeat(body), of.routine), is_unchecked=False)
 
 
 # ---- whole lists
@@ -303,7 +303,7 @@ def length(lowering: Lowering, node: tree.Node) -> Routine:
 def contains(lowering: Lowering, node: tree.Contains) -> Routine:
     """Lower `in`. All elements are evaluated."""
     sought = lowering.names.temporary()
-    result = routine(lowering.value(node.sought), keep(sought), DROP, integer(0))
+    result = routine(lowering.value(node.sought), store(sought), DROP, integer(0))
     again = (load(sought),)
 
     def look(one: Routine, kind: Kind) -> Routine:
@@ -338,8 +338,8 @@ def extreme(lowering: Lowering, node: tree.Call, of_integers: Op, of_reals: Op) 
     whole, left = lowering.names.temporary(), lowering.names.temporary()
     operator = of_reals if isinstance(kind, FloatKind) else of_integers
     step = Operation(operator, flag=0 if isinstance(kind, FloatKind) else signs(kind, kind, kind))
-    first = routine(of.routine, keep(whole), Operation(Op.ELEMENT, flag=of.scalar))
-    rest = routine(load(whole), keep(left), SIZE, repeat((Operation(Op.NEXT, left, flag=of.scalar), step)))
+    first = routine(of.routine, store(whole), Operation(Op.ELEMENT, flag=of.scalar))
+    rest = routine(load(whole), store(left), SIZE, repeat((Operation(Op.NEXT, left, flag=of.scalar), step)))
     return coerced(routine(first, rest), kind, node.kind)
 
 

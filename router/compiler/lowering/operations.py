@@ -75,7 +75,7 @@ def load(slot: Slot) -> Operation:
     return Operation(Op.LOAD, slot)
 
 
-def keep(slot: Slot) -> Operation:
+def store(slot: Slot) -> Operation:
     return Operation(Op.KEEP, slot)
 
 
@@ -106,7 +106,7 @@ def choice(test: Routine, body: Routine, orelse: Routine) -> Routine:
 
 def once(computed: Routine, flag: Flag, kept: Slot) -> Routine:
     """Return `computed` for a loop: it is computed on first use and then kept. `flag` is 0 before the loop."""
-    return choice((load(flag),), (load(kept),), routine(computed, keep(kept), integer(1), keep(flag), DROP))
+    return choice((load(flag),), (load(kept),), routine(computed, store(kept), integer(1), store(flag), DROP))
 
 
 # ---- static analysis

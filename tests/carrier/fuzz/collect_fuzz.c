@@ -26,23 +26,23 @@ static const struct target only = {.filtered = FILTERED, .collected = COLLECTED,
 static const struct targets to = {.layout = &layout, .sources = sources, .collect = &collects, .targets = &only, .count = 1,
                                   .topic = NO_NAME};
 static counter counters[COUNTERS];
-static struct stage stage;
+static struct thread_env env;
 static int64_t now = 1, offered, delivered;
 
 static void demand(bool condition) {
     if (!condition) abort();
 }
 
-static int64_t clock_now(struct stage *of) {
+static int64_t clock_now(struct thread_env *of) {
     (void)of;
     return now;
 }
 
 int LLVMFuzzerInitialize(int *argc, char ***arguments) {
     (void)argc, (void)arguments;
-    struct timers *timers = timers_open_on(&stage, false);
-    demand(timers && stage_open(&stage, counters, ring_open(1 << 12), timers));
-    stage.now = clock_now;
+    struct timers *timers = timers_open_on(&env, false);
+    demand(timers && env_open(&env, counters, ring_open(1 << 12), timers));
+    env.now = clock_now;
     collects.collector = collector_open(TIMEOUT);
     demand(collects.collector != NULL);
     const struct adoption adoption = {.timer = &collects.collector->timer, .to = &to};
@@ -80,10 +80,10 @@ static uint64_t take_field(struct bytes *from, uint32_t number) {
 
 /* All parts of a frame are there, in order, as they were sent. */
 static void check_frame(uint64_t name, uint64_t size) {
-    struct value *slots = stage.machine.slots, list = slots[ITEMS];
+    struct value *slots = env.machine.slots, list = slots[ITEMS];
     demand(list.size == size && slots[COUNTED].bits == size && slots[BY].bits == name && !slots[PLACE].bits);
     for (uint64_t index = 0; index < size; index++) {
-        struct value payload = list_next(&stage.machine, &list, IN_CELLS);
+        struct value payload = list_next(&env.machine, &list, IN_CELLS);
         struct bytes rest = {payload.bytes, payload.bytes + payload.size}, filled;
         uint32_t tag;
         demand(take_field(&rest, 1) == name && take_field(&rest, 2) == size && take_field(&rest, 3) == index);
@@ -108,7 +108,7 @@ static void offer_one(uint64_t name, uint64_t size, uint64_t index, uint32_t col
     datagram.size = datagram.length = make(data, name, size, index, more);
     struct message message = {.datagram = &datagram, .now = now};
     offered++;
-    if (collect(&stage, &to, &message)) {
+    if (collect(&env, &to, &message)) {
         delivered++;
         demand(message.is_read && message.outcome == EVALUATED);
         check_frame(name, size);
@@ -123,12 +123,12 @@ int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
         uint64_t of = SIZES[input[2] % (sizeof SIZES / sizeof *SIZES)], first = input[3] >> 4;
         uint32_t more = input[0] & 1 ? (uint32_t)input[1] * 60 : input[1];
         now += PAUSES[input[0] >> 1 & 7];
-        if (input[0] & 16) timers_serve(stage.timers, now);
+        if (input[0] & 16) timers_serve(env.timers, now);
         for (uint64_t index = 0; index <= (input[3] & 15u) * (input[0] & 32 ? 70u : 1u); index++)
             offer_one(input[2] >> 4 | input[0] >> 6 << 4, of, first + index, input[0] >> 7, more);
     }
     now += 3 * TIMEOUT;
-    timers_serve(stage.timers, now);
+    timers_serve(env.timers, now);
     demand(!collects.collector->open);
     check_limits();
     return 0;

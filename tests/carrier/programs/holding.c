@@ -23,7 +23,7 @@ struct program {
     uint32_t generation;
 };
 
-static struct stage sending;
+static struct thread_env sending;
 static struct timers *timers;
 static struct pacer *pacer;
 static counter counters[COUNTERS];
@@ -35,10 +35,10 @@ static long messages;
 static uint8_t *left; /* how often each message has left, by thread and number */
 
 /* Under the lock of the timers. Some fail. */
-static int note_sent(struct stage *stage, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+static int note_sent(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
     uint32_t number;
     (void)target;
-    if (stage->now(stage) > expires) return COMMAND_STALE;
+    if (env->now(env) > expires) return COMMAND_STALE;
     check(size >= sizeof number, "a message is whole");
     memcpy(&number, data, sizeof number);
     check(!left[number]++, "no message leaves twice");
@@ -115,10 +115,10 @@ static void *wait_for_timer(void *unused) {
 static void *offer(void *which) {
     uint32_t thread = (uint32_t)(uintptr_t)which;
     unsigned random = thread + 1;
-    struct stage stage;
+    struct thread_env env;
     static counter unused[OFFERING];
-    check(stage_open(&stage, unused, NULL, timers), "memory");
-    stage.timers = timers;
+    check(env_open(&env, unused, NULL, timers), "memory");
+    env.timers = timers;
     for (uint32_t number = 0; number < messages; number++) {
         const struct program *program = atomic_load(&current);
         uint32_t id = thread * (uint32_t)messages + number, index = (uint32_t)rand_r(&random) % TARGETS;
@@ -128,17 +128,17 @@ static void *offer(void *which) {
         memcpy(datagram, &id, sizeof id);
         const uint8_t *data = datagram;
         if (rand_r(&random) % 2) {
-            stage.machine.output.size = 0;
-            check(append(&stage.machine.output, datagram, size), "memory");
-            data = stage.machine.output.data;
+            env.machine.output.size = 0;
+            check(append(&env.machine.output, datagram, size), "memory");
+            data = env.machine.output.data;
         }
-        check(defer(&stage, program->deferrals[index], data, size, expires, now), "nobody is left");
+        check(defer(&env, program->deferrals[index], data, size, expires, now), "nobody is left");
         atomic_fetch_add(&offered, 1);
         atomic_store(&seen[thread], program->generation);
         if (number % 16 == 0) usleep(100);
     }
     atomic_store(&seen[thread], UINT32_MAX);
-    stage_close(&stage);
+    env_close(&env);
     return NULL;
 }
 
@@ -147,7 +147,7 @@ int main(int count, char **arguments) {
     messages = atol(arguments[1]);
     left = calloc(OFFERING * (size_t)messages, 1);
     struct ring *events = ring_open(1 << 12);
-    check(stage_open(&sending, counters, events, NULL), "memory");
+    check(env_open(&sending, counters, events, NULL), "memory");
     sending.send = note_sent;
     timers = timers_open_on(&sending, true);
     sending.timers = timers;
@@ -175,7 +175,7 @@ int main(int count, char **arguments) {
     free(last);
     pacer_close(pacer);
     timers_close(timers);
-    stage_close(&sending);
+    env_close(&sending);
     ring_close(events);
     free(left);
     return 0;

@@ -105,7 +105,7 @@ static void make_target(struct made *made, int index) {
     made->targets[index].dropped[DROP_PUBLISH_ERROR] = topic_counter(index, REFUSED);
 }
 
-static struct made *make(const struct round *stage, uint32_t generation) {
+static struct made *make(const struct round *env, uint32_t generation) {
     struct made *made = calloc(1, sizeof *made);
     check(made, "memory");
     made->of_payload = (struct wanted_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .section = NONE,
@@ -122,7 +122,7 @@ static struct made *make(const struct round *stage, uint32_t generation) {
     made->route = (struct route){.publishes = publishes, .last_message = LAST, .duration = DURATION};
     made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
     made->choice = (struct choice){0, ACCEPTED};
-    made->listener = (struct listener){.fd = stage->socket, .choices = &made->choice, .columns = 1, .received = RECEIVED,
+    made->listener = (struct listener){.fd = env->socket, .choices = &made->choice, .columns = 1, .received = RECEIVED,
                                        .received_bytes = BYTES, .padded = PADDED, .superseded = SUPERSEDED};
     for (int reason = 0; reason < REASONS; reason++) made->listener.rejected[reason] = (uint32_t)(REJECTED + reason);
     made->program = (struct program){.generation = generation, .listener_count = 1, .case_count = 1,
@@ -133,23 +133,23 @@ static struct made *make(const struct round *stage, uint32_t generation) {
 
 /* Free a program that nothing in the ring refers to. The receive thread may just be dropping such a message: it is done
  * with that a turn later. */
-static void free_made(const struct round *stage, struct made *made) {
-    uint64_t turns = carrier_turns(stage->carrier);
-    while (carrier_turns(stage->carrier) == turns) usleep(50);
+static void free_made(const struct round *env, struct made *made) {
+    uint64_t turns = carrier_turns(env->carrier);
+    while (carrier_turns(env->carrier) == turns) usleep(50);
     memset(made, 0, sizeof *made);
     free(made);
 }
 
-static struct made *replace_all(const struct round *stage, struct made *running) {
+static struct made *replace_all(const struct round *env, struct made *running) {
     for (uint32_t generation = 2; generation <= PROGRAMS; generation++) {
-        struct made *next = make(stage, generation);
+        struct made *next = make(env, generation);
         struct change change = {.program = &next->program};
-        carrier_change(stage->carrier, &change);
-        publish_advance(stage->publishing, generation);
+        carrier_change(env->carrier, &change);
+        publish_advance(env->publishing, generation);
         __atomic_store_n(&wanted[0], generation % 5 != 0, __ATOMIC_RELAXED);
         usleep(generation % 7 * 300);
-        while (!publish_has_reached(stage->publishing, generation)) usleep(100);
-        free_made(stage, running);
+        while (!publish_has_reached(env->publishing, generation)) usleep(100);
+        free_made(env, running);
         running = next;
     }
     return running;
@@ -166,11 +166,11 @@ static size_t make_datagram(uint32_t number, uint8_t *data) {
 }
 
 static void *send_datagrams(void *of) {
-    const struct round *stage = of;
+    const struct round *env = of;
     int from = socket(AF_INET, SOCK_DGRAM, 0);
     struct sockaddr_in to;
     socklen_t length = sizeof to;
-    getsockname(stage->socket, (struct sockaddr *)&to, &length);
+    getsockname(env->socket, (struct sockaddr *)&to, &length);
     for (uint32_t number = 1; !atomic_load(&has_ended); number++) {
         uint8_t data[8];
         sendto(from, data, make_datagram(number, data), 0, (struct sockaddr *)&to, sizeof to);
@@ -189,75 +189,75 @@ static void check_balance(const int64_t *counts) {
 }
 
 static void *watch(void *of) {
-    const struct round *stage = of;
+    const struct round *env = of;
     static uint64_t records[4096];
     int64_t counts[COUNTERS];
     uint32_t topic;
     while (!atomic_load(&has_ended)) {
-        if (publish_counters(stage->publishing, counts, COUNTERS)) check_balance(counts);
-        if (publish_since(stage->publishing, &topic)) check(topic <= TOPICS, "it is a topic");
-        carrier_pulse(stage->carrier);
-        ring_take(stage->events, records, sizeof records, 1000000);
+        if (publish_counters(env->publishing, counts, COUNTERS)) check_balance(counts);
+        if (publish_since(env->publishing, &topic)) check(topic <= TOPICS, "it is a topic");
+        carrier_pulse(env->carrier);
+        ring_take(env->events, records, sizeof records, 1000000);
     }
     return NULL;
 }
 
 /* ---- rounds ---- */
 
-static void open_stage(struct round *stage) {
+static void open_env(struct round *env) {
     struct sockaddr_in any = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
-    stage->received = calloc(COUNTERS, sizeof *stage->received);
-    stage->published = calloc(COUNTERS, sizeof *stage->published);
-    stage->events = ring_open(1 << 14);
-    stage->rejections = ring_open(1 << 12);
-    stage->messages = ring_open(QUEUE);
-    stage->timers = timers_open(stage->received, stage->rejections);
-    stage->carrier = carrier_open(stage->timers, stage->received, stage->rejections, stage->messages);
-    stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
-    check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
-    stage->publishing = publish_open(stage->messages, stage->published, stage->events, publish, why, forget,
+    env->received = calloc(COUNTERS, sizeof *env->received);
+    env->published = calloc(COUNTERS, sizeof *env->published);
+    env->events = ring_open(1 << 14);
+    env->rejections = ring_open(1 << 12);
+    env->messages = ring_open(QUEUE);
+    env->timers = timers_open(env->received, env->rejections);
+    env->carrier = carrier_open(env->timers, env->received, env->rejections, env->messages);
+    env->socket = socket(AF_INET, SOCK_DGRAM, 0);
+    check(!bind(env->socket, (struct sockaddr *)&any, sizeof any), "bind");
+    env->publishing = publish_open(env->messages, env->published, env->events, publish, why, forget,
                                      NULL);
-    check(stage->publishing, "the thread starts");
+    check(env->publishing, "the thread starts");
 }
 
-static void close_stage(struct round *stage) {
-    carrier_close(stage->carrier);
-    timers_close(stage->timers);
-    ring_close(stage->messages);
-    ring_close(stage->events);
-    ring_close(stage->rejections);
-    free(stage->received);
-    free(stage->published);
-    close(stage->socket);
+static void close_env(struct round *env) {
+    carrier_close(env->carrier);
+    timers_close(env->timers);
+    ring_close(env->messages);
+    ring_close(env->events);
+    ring_close(env->rejections);
+    free(env->received);
+    free(env->published);
+    close(env->socket);
 }
 
 /* All that was received came to something. */
-static void check_accounts(const struct round *stage) {
-    check_balance((const int64_t *)stage->published);
+static void check_accounts(const struct round *env) {
+    check_balance((const int64_t *)env->published);
     for (int topic = 0; topic < TOPICS; topic++) {
         int64_t sum = 0;
         for (int which = WAITING; which <= REFUSED; which++)
-            sum += stage->received[topic_counter(topic, which)] + stage->published[topic_counter(topic, which)];
-        check(sum == stage->received[ACCEPTED], "each message is counted once");
-        check(!(stage->received[topic_counter(topic, WAITING)] + stage->published[topic_counter(topic, WAITING)]),
+            sum += env->received[topic_counter(topic, which)] + env->published[topic_counter(topic, which)];
+        check(sum == env->received[ACCEPTED], "each message is counted once");
+        check(!(env->received[topic_counter(topic, WAITING)] + env->published[topic_counter(topic, WAITING)]),
               "nothing waits");
     }
 }
 
 /* Play a round. In some, the thread is stuck at the end, and left. */
 static void play(int round) {
-    struct round stage;
+    struct round env;
     bool gets_stuck = round % 4 == 3;
     memset(latest, 0, sizeof latest);
-    open_stage(&stage);
-    struct made *first = make(&stage, 1);
+    open_env(&env);
+    struct made *first = make(&env, 1);
     struct change start = {.program = &first->program};
-    check(!carrier_start(stage.carrier, &start), "the carrier starts");
+    check(!carrier_start(env.carrier, &start), "the carrier starts");
     pthread_t sending, watching;
     atomic_store(&has_ended, false);
-    pthread_create(&sending, NULL, send_datagrams, &stage);
-    pthread_create(&watching, NULL, watch, &stage);
-    struct made *last = replace_all(&stage, first);
+    pthread_create(&sending, NULL, send_datagrams, &env);
+    pthread_create(&watching, NULL, watch, &env);
+    struct made *last = replace_all(&env, first);
     if (gets_stuck) {
         __atomic_store_n(&wanted[0], 1, __ATOMIC_RELAXED);
         atomic_store(&is_stuck, true);
@@ -267,14 +267,14 @@ static void play(int round) {
     atomic_store(&has_ended, true);
     pthread_join(sending, NULL);
     pthread_join(watching, NULL);
-    carrier_stop_receiving(stage.carrier);
-    bool has_stopped = publish_stop(stage.publishing);
+    carrier_stop_receiving(env.carrier);
+    bool has_stopped = publish_stop(env.publishing);
     check(has_stopped == !gets_stuck, "it stops unless it is stuck");
-    if (has_stopped) check_accounts(&stage);
-    else left[round] = stage.publishing;
-    printf("%lld received, %lld and %lld published\n", (long long)stage.received[ACCEPTED],
-           (long long)stage.published[topic_counter(0, PUBLICATIONS)], (long long)stage.published[topic_counter(1, PUBLICATIONS)]);
-    close_stage(&stage);
+    if (has_stopped) check_accounts(&env);
+    else left[round] = env.publishing;
+    printf("%lld received, %lld and %lld published\n", (long long)env.received[ACCEPTED],
+           (long long)env.published[topic_counter(0, PUBLICATIONS)], (long long)env.published[topic_counter(1, PUBLICATIONS)]);
+    close_env(&env);
     free(last);
     atomic_store(&is_stuck, false);
     while (atomic_load(&inside)) usleep(100);

@@ -1,10 +1,10 @@
-/* The stage for rehearsal executes a program without threads, sockets or middleware, on a simulated clock. The caller passes
- * messages and sets the clock; the outcome is recorded, in order. The stage runs the functions of a router's threads
+/* A simulation executes a program without threads, sockets or middleware, on a simulated clock. The caller passes
+ * messages and sets the clock; the outcome is recorded, in order. It runs the functions of a router's threads
  * synchronously.
  *
  * Every topic has subscribers, and the network and the middleware accept everything. */
-#ifndef REHEARSAL_H
-#define REHEARSAL_H
+#ifndef SIMULATION_H
+#define SIMULATION_H
 
 #include <stddef.h>
 #include <stdint.h>
@@ -33,38 +33,38 @@ struct output_record {
     uint32_t target, length; /* `target`: as in events */
 };
 
-struct rehearsal;
+struct simulation;
 
-/* Open a stage that counts in `counters`, at this boot-clock time. Returns NULL if memory or descriptors run out. */
-struct rehearsal *rehearsal_open(counter *counters, int64_t now);
-void rehearsal_close(struct rehearsal *rehearsal); /* when it has no timer left */
+/* Open a simulation that counts in `counters`, at this boot-clock time. Returns NULL if memory or descriptors run out. */
+struct simulation *simulation_open(counter *counters, int64_t now);
+void simulation_close(struct simulation *simulation); /* when it has no timer left */
 
 /* The timers of destinations: deadmen of its programs are opened there. */
-struct timers *rehearsal_timers(struct rehearsal *rehearsal);
+struct timers *simulation_timers(struct simulation *simulation);
 
 /* Switch to another program, as at a reload, or to the first one. `published` are the changes to the timers of topics.
  * Everything belongs to the caller. */
-void rehearsal_adopt(struct rehearsal *rehearsal, const struct change *change, const struct timer_change *published,
+void simulation_adopt(struct simulation *simulation, const struct change *change, const struct timer_change *published,
                      const struct ros_topic *topics);
 
 /* Receive a datagram on a listener, or a message from ROS on a topic, by index in the program. `arrived_at` and `sent_at`
  * are wall-clock times. */
-void rehearsal_datagram(struct rehearsal *rehearsal, uint32_t listener, uint32_t address, uint32_t port, const void *data,
+void simulation_datagram(struct simulation *simulation, uint32_t listener, uint32_t address, uint32_t port, const void *data,
                         size_t size, int64_t arrived_at);
-void rehearsal_message(struct rehearsal *rehearsal, uint32_t topic, const void *data, size_t size, int64_t sent_at);
+void simulation_message(struct simulation *simulation, uint32_t topic, const void *data, size_t size, int64_t sent_at);
 
 /* Advance the clock to that time, and serve timers that become due. Never goes back. */
-void rehearsal_advance(struct rehearsal *rehearsal, int64_t to);
+void simulation_advance(struct simulation *simulation, int64_t to);
 
 /* Set the wall clock to `ahead` ns ahead of the boot clock; 0 at first. */
-void rehearsal_set_clock(struct rehearsal *rehearsal, int64_t ahead);
+void simulation_set_clock(struct simulation *simulation, int64_t ahead);
 
 /* Stop as the router does: send what is held back, then have armed deadmen send. */
-void rehearsal_end(struct rehearsal *rehearsal);
+void simulation_end(struct simulation *simulation);
 
 /* Return the records since the last call, valid until the next call of any function, and their size in bytes; NULL if
  * memory runs out. */
-const void *rehearsal_records(struct rehearsal *rehearsal, size_t *size);
+const void *simulation_records(struct simulation *simulation, size_t *size);
 
 /* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender. Return EVALUATED, an
  * enum drop_reason if it has no value for this payload or the payload is malformed, or DROP_REASONS if memory runs out. */

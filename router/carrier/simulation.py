@@ -1,4 +1,4 @@
-"""The stage (`native/rehearsal.c`): executes programs on a simulated clock, without threads, sockets or ROS."""
+"""The simulation (`native/simulation.c`): executes programs on a simulated clock, without threads, sockets or ROS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from router import declared as c
 from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned
 from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
-from router.compiler.program import Program
+from router.compiler.compiled_table import CompiledTable
 from router.declared import MOST_COUNTERS, RecordKind
 from router.image.image import Image
 from router.image.names import Names
@@ -44,7 +44,7 @@ class Output(NamedTuple):
 Record = Union[Time, Increment, Output, DeadmanEvents, Returned, CountedReport]
 
 
-class Stage:
+class Simulation:
     """Rehearses programs. `records` returns the outcome of every input and of timers that were due.
 
     The wall clock is `ahead` of the boot clock, by 0 ns at first. All times in ns.
@@ -65,7 +65,7 @@ class Stage:
         """Return the first `count` counters."""
         return self._opened.counters[:count]
 
-    def adopt(self, program: Program) -> None:
+    def adopt(self, program: CompiledTable) -> None:
         """Switch to a program, with state passed on by key as at a reload. Raises MemoryError."""
         before = self._opened.running
         self._generation += 1
@@ -80,7 +80,7 @@ class Stage:
         self.now = now
         self._serve(self._loaded(program, image, None), None)
 
-    def _loaded(self, program: Program, image: Image, before: LoadedImage | None) -> _Running:
+    def _loaded(self, program: CompiledTable, image: Image, before: LoadedImage | None) -> _Running:
         opened = self._opened
         senders = {name: opened.sender(name, address) for name, address, *_ in image.senders}
         loaded = LoadedImage(opened.library, image, senders, opened.timers, self._generation, before)
@@ -92,7 +92,7 @@ class Stage:
         deadmen = earlier.deadmen.values() if earlier else ()
         ended = [each.address for each in deadmen if each not in image.deadmen.values()]
         change, of_topics = image.change(earlier, ended), image.timers(earlier, of_topics=True)
-        self._library.rehearsal_adopt(
+        self._library.simulation_adopt(
             self._opened.address, ctypes.byref(change), ctypes.byref(of_topics), running.topics
         )
         self._opened.running = running
@@ -101,32 +101,34 @@ class Stage:
         """Receive a datagram. `arrived_at` is wall-clock time. Raises KeyError for an unknown listener."""
         host, port = peer
         number = self._in_use.listeners[listener]
-        self._library.rehearsal_datagram(self._opened.address, number, _number(host), port, data, len(data), arrived_at)
+        self._library.simulation_datagram(
+            self._opened.address, number, _number(host), port, data, len(data), arrived_at
+        )
 
     def message(self, topic: str, data: bytes, sent_at: int) -> None:
         """Take a message from ROS. `sent_at` is wall-clock time. Raises KeyError for a topic without a route."""
         number = self._in_use.topic_numbers[topic]
-        self._library.rehearsal_message(self._opened.address, number, data, len(data), sent_at)
+        self._library.simulation_message(self._opened.address, number, data, len(data), sent_at)
 
     def advance(self, to: int) -> None:
         """Advance the clock to that time, and serve timers that become due. Never goes back."""
-        self._library.rehearsal_advance(self._opened.address, to)
+        self._library.simulation_advance(self._opened.address, to)
         self.now = max(self.now, to)
 
     def set_clock(self, ahead: int) -> None:
         """Set how far the wall clock is ahead of the boot clock."""
-        self._library.rehearsal_set_clock(self._opened.address, ahead)
+        self._library.simulation_set_clock(self._opened.address, ahead)
 
     def end(self) -> None:
         """Stop as the router does."""
-        self._library.rehearsal_end(self._opened.address)
+        self._library.simulation_end(self._opened.address)
 
     def records(self) -> Iterator[Record]:
         """Yield the records since the last call. Raises MemoryError."""
         size = ctypes.c_size_t()
-        address = self._library.rehearsal_records(self._opened.address, ctypes.byref(size))
+        address = self._library.simulation_records(self._opened.address, ctypes.byref(size))
         if size.value and not address:
-            raise MemoryError("there is no room for the records of the stage")
+            raise MemoryError("there is no room for the records of the simulation")
         records = memoryview(bytearray(ctypes.string_at(address, size.value) if address else b""))
         at = 0
         while at < len(records):
@@ -164,7 +166,7 @@ class Stage:
 
 
 class _Opened:
-    """The C stage, its senders, and the program that it executes."""
+    """The C simulation, its senders, and the program that it executes."""
 
     def __init__(self, library: ctypes.CDLL, now: int) -> None:
         self.library = library
@@ -174,10 +176,10 @@ class _Opened:
         self._open(now)
 
     def _open(self, now: int) -> None:
-        self.address: int = self.library.rehearsal_open(self.counters, now) or 0
+        self.address: int = self.library.simulation_open(self.counters, now) or 0
         if not self.address:
-            raise MemoryError("the stage cannot be opened")
-        self.timers: int = self.library.rehearsal_timers(self.address)
+            raise MemoryError("the simulation cannot be opened")
+        self.timers: int = self.library.simulation_timers(self.address)
 
     def sender(self, endpoint: str, address: Peer) -> _Sender:
         """Return the sender of an endpoint; one that gets another address gets another sender."""
@@ -191,14 +193,14 @@ class _Opened:
         self._open(now)
 
     def close(self) -> None:
-        """End all timers, and free them before the stage."""
+        """End all timers, and free them before the simulation."""
         if not self.address:
             return
-        self.library.rehearsal_end(self.address)
+        self.library.simulation_end(self.address)
         if self.running is not None:
             self.running.image.close()
         self.running = None
-        self.library.rehearsal_close(self.address)
+        self.library.simulation_close(self.address)
         self.address = 0
 
 
@@ -209,7 +211,7 @@ class _Sender:
         self._library = library
         self.address = int(library.sender_open(-1, -1, 0, 0) or 0)
         if not self.address:
-            raise MemoryError("a sender of the stage cannot be opened")
+            raise MemoryError("a sender of the simulation cannot be opened")
 
     def __del__(self) -> None:
         if self.address:
@@ -227,9 +229,9 @@ _TOPIC = _Topic()
 
 
 class _Running:
-    """A program as the stage executes it. Listeners and topics are numbered by their index in its arrays."""
+    """A program as the simulation executes it. Listeners and topics are numbered by their index in its arrays."""
 
-    def __init__(self, program: Program, image: LoadedImage) -> None:
+    def __init__(self, program: CompiledTable, image: LoadedImage) -> None:
         self.program, self.image = program, image
         self.listeners: Mapping[str, int] = {plan.name: number for number, plan in enumerate(program.listeners)}
         routes = [*image.ros_routes()]

@@ -141,7 +141,7 @@ class RoutePlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
+class CompiledTable:
     """A compiled table. `senders` are all endpoints that are sent to, `lowered` has the routines of the carrier.
 
     `inbound` has the routes by envelope field number; several routes of a case differ in their sources. `outbound` has
