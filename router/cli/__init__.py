@@ -216,9 +216,11 @@ def _import_problem(error: ImportError) -> ConfigurationError | None:
     """Return the error to show for a failed import; None if it has another cause than the installation."""
     if "declared" in error.msg:
         return ConfigurationError("router/declared.py does not match the headers of the carrier", "run 'make setup'")
-    from router.compiler.extras import extra_of, missing_extra  # which needs the declarations
+    if not isinstance(error, ModuleNotFoundError):
+        return None
+    from router.compiler.extras import extra_of, missing_extra  # which needs declarations and memory
 
-    if is_shortage(error) or (extra := extra_of(error.name or "")) is None:
+    if (extra := extra_of(error.name or "")) is None:
         return None
     return missing_extra(f"this needs a Python package that is not installed: {error.name}", extra)
 
