@@ -20,7 +20,7 @@ class Change:
     """A program that is being adopted, with what each participant has prepared for it.
 
     `before` is the image that it replaces: that of the running program or of a head start, None without either.
-    `is_first` if no program runs yet.
+    `is_first` if no program runs yet. `opens_node` and `starts_gateways`: neither is there without this change.
     """
 
     program: CompiledTable
@@ -31,3 +31,5 @@ class Change:
     ros: RosChange | None = None
     routes: RosRoutes | None = None
     gateways: GatewayChange | None = None
+    opens_node: bool = False
+    starts_gateways: bool = False

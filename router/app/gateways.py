@@ -22,7 +22,6 @@ class Gateways:
     def __init__(self, topics: Topics, drops: KernelDrops, counts: ThreadCounts, reporter: Reporter) -> None:
         self.thread: GatewayThread | None = None
         self.refused: Counter[str] = Counter()
-        self._started_for: Change | None = None
         self._topics = topics
         self._drops = drops
         self._counts = counts
@@ -35,7 +34,7 @@ class Gateways:
         if self._topics.node is None or not (change.program.gateways or self.thread):
             return
         if self.thread is None:
-            self.thread, self._started_for = self._start_thread(), change
+            self.thread, change.starts_gateways = self._start_thread(), True
         deadmen = change.image.client_deadmen if change.image else {}
         feed = {name: deadman.feed for name, deadman in deadmen.items()}
         change.gateways = self.thread.prepare(change.program, feed)
@@ -44,7 +43,7 @@ class Gateways:
         """Close the gateways that `prepare` has opened, and reopen those that it or `adopt` has closed."""
         if self.thread is not None and change.gateways is not None:
             self.thread.undo(change.gateways)
-        if self._started_for is change:
+        if change.starts_gateways:
             self.close()
 
     def adopt(self, change: Change) -> None:

@@ -33,7 +33,6 @@ class Topics:
     ) -> None:
         self.node: RouterNode | None = None
         self._program: CompiledTable | None = None
-        self._opened_for: Change | None = None
         self._ros_args = ros_args
         self._report_incompatible = incompatible
         self._subscriber_joined = subscriber_joined
@@ -57,14 +56,14 @@ class Topics:
         if self.node is None and not needs_ros(program):
             return
         if self.node is None:
-            self.node, self._opened_for = self._open_node(program), change
+            self.node, change.opens_node = self._open_node(program), True
         change.ros = self.node.prepare(program.publishers, program.subscriptions, _topic_spans(program))
 
     def undo(self, change: Change) -> None:
         """Close what `prepare` has opened."""
         if self.node is not None and change.ros is not None:
             self.node.undo(change.ros)
-        if self._opened_for is change:
+        if change.opens_node:
             self.close()
 
     def adopt(self, change: Change) -> None:

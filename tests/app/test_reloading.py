@@ -10,6 +10,7 @@ import re
 import shutil
 import socket
 import threading
+import weakref
 from collections.abc import Callable
 from time import sleep, time
 from types import SimpleNamespace
@@ -551,6 +552,24 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
         assert router.reload().text == "the router is not running"
         with pytest.raises(BlockingIOError):
             hearing.recv(1000)
+
+
+@pytest.mark.parametrize("has_topics", [True, False])
+def test_a_reload_frees_what_only_the_first_table_had(site: Site, has_topics: bool) -> None:
+    """Its image and its deadmen, for example."""
+    if has_topics:
+        pytest.importorskip("rclpy", reason="needs ROS 2")
+    gateways = f"gateways:\n  it: {{transport: {{tcp: 127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}}}}}\n"
+    routes = (TOPIC if has_topics else PH) + turns("1h")
+    with site.router(routes + gateways * has_topics) as router:
+        image = router._runtime.plane.image
+        assert image
+        first, deadman = weakref.ref(image), weakref.ref(image.deadmen["manual_drive"])
+        del image
+        site.write(routes.replace("1h", "2h") + gateways * has_topics)
+        assert router.reload().ok
+        gc.collect()
+        assert (first(), deadman()) == (None, None)
 
 
 def adoption_of(counters: Counters) -> Change:
