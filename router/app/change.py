@@ -20,12 +20,14 @@ class Change:
     """A program that is being adopted, with what each participant has prepared for it.
 
     `before` is the image that it replaces: that of the running program or of a head start, None without either.
-    `is_first` if no program runs yet. `opens_node` and `starts_gateways`: neither is there without this change.
+    `is_first` if no program runs yet; `is_same`: the image of the head start is equal, None without one. `opens_node`
+    and `starts_gateways`: neither is there without this change.
     """
 
     program: CompiledTable
     before: LoadedImage | None
     is_first: bool
+    is_same: bool | None = None
     sockets: SocketChange | None = None
     image: LoadedImage | None = None
     ros: RosChange | None = None

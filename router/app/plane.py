@@ -70,6 +70,7 @@ class Images:
         change.image.bind_listeners(change.sockets.listeners)
         if change.is_first:
             has_sent = [*change.before.deadmen.values()] if change.before is not None else []
+            change.is_same = change.before.image == image if change.before is not None else None
             for route, deadman in change.image.deadmen.items():
                 sent = self._sent.get(route) if deadman in has_sent else deadman.start(boottime_ns())
                 if sent:
@@ -160,16 +161,17 @@ class Plane:
         assert image is not None  # noqa: S101 - prepared
         publications = change.ros.publications if change.ros else {}
         subscriptions = change.ros.subscriptions if change.ros else {}
-        for each in (image, change.before):
-            if each is not None and (each is image or change.is_first):  # of a head start, messages may be waiting
-                each.bind_topics(publications)
+        image.bind_topics(publications)
         image.open_client_deadmen(self._client_deadmen.group)
         change.routes = RosRoutes.of(image, {topic: each.raw for topic, each in subscriptions.items()})
-        if change.is_first and self._head_start is not None and self._head_start.image != image.image:
+        waiting = None
+        if change.is_first and change.before is not None:
+            change.before.bind_topics(publications)  # messages of the head start may be waiting
+            waiting = change.before.topic_change()
+        if change.is_same is False:
             self._programs = {}  # they would not explain its events
         if change.program.publishers:
-            first = self._head_start.topic_change() if change.is_first and self._head_start is not None else None
-            self._publishing.start(_functions_of_rcl(self.library), first)
+            self._publishing.start(_functions_of_rcl(self.library), waiting)
         for thread in self._from_ros:
             if change.routes.only(urgent=thread.is_urgent).topics:
                 from router.ros.receiving import RESET, TAKE  # rclpy is loaded: the topics are open

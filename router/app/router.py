@@ -77,7 +77,6 @@ class Router:
         self.is_ready = False
         self._first = program
         self._start = "refused" if is_refused else "compiled"
-        self._head_start = head_start
         self._reporter = Reporter(self._address_of)
         self._obedience = Obedience()
         self._counts = ThreadCounts(program.counters)
@@ -105,7 +104,10 @@ class Router:
             if self._first.table.record is not None:  # for the recorder, which opens later, but records from here on
                 self._runtime.plane.observe(is_observed=True)
             change = self._runtime.start(self._first)
-            self._compare_with_head_start(change)
+            if change.is_same is not None:
+                self._start = "kept" if change.is_same else "replaced"
+            if change.is_same is False:
+                logger.warning("an input has changed since the start: the compiled program replaces the kept one")
             with background_threads():
                 self._open_services(change, services)
             self._reloader.open()
@@ -127,14 +129,6 @@ class Router:
         if self._saver is not None and change.image is not None:
             self._saver.save(change.image.image, self._saver.read)
         return self
-
-    def _compare_with_head_start(self, change: Change) -> None:
-        head_start, self._head_start = self._head_start, None
-        if head_start is not None and change.image is not None:
-            is_same = head_start.image.image == change.image.image
-            self._start = "kept" if is_same else "replaced"
-            if not is_same:
-                logger.warning("an input has changed since the start: the compiled table replaces the startup image")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -112,7 +112,7 @@ class Sockets:
         self._library = library
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
-        self._inherited: list[ListeningSocket] = [*head_start.listening.values()] if head_start else []
+        self._of_head_start: list[ListeningSocket] = [*head_start.listening.values()] if head_start else []
         self._senders: dict[str, tuple[object, NativeSender]] = {**head_start.senders} if head_start else {}
         self._drops = drops
 
@@ -145,7 +145,7 @@ class Sockets:
                 senders[to.name] = sender
             used = [each.opened for each in listeners.values()]
             left: list[Listener | ListeningSocket] = [each for each in self._bound.values() if each.opened not in used]
-            left += [each for each in self._inherited if each not in used]
+            left += [each for each in self._of_head_start if each not in used]
             change.sockets = SocketChange(listeners, senders, moves, left, opening.pop_all())
 
     def _listener(self, plan: endpoints.Listener, opening: ExitStack) -> Listener:
@@ -153,7 +153,7 @@ class Sockets:
         listener = self._bound.get(plan.bound_to)
         if listener is None or listener.is_replaceable():
             wanted = tuple(plan.address.value), plan.interface
-            opened = next((each for each in self._inherited if each.wanted == wanted), None)
+            opened = next((each for each in self._of_head_start if each.wanted == wanted), None)
             listener = Listener(plan, opened=opened, has_senders=plan.address.value.port in self._sending_ports())
             if opened is None:
                 opening.callback(listener.close)
@@ -186,7 +186,7 @@ class Sockets:
         self._follow_drops(sockets.listeners)
         for name, each in sockets.listeners.items():
             each.follow(plans[name])
-        self.listeners, self._inherited = sockets.listeners, []
+        self.listeners, self._of_head_start = sockets.listeners, []
         self._bound = {plans[name].bound_to: each for name, each in sockets.listeners.items()}
         self._senders = {to.name: (_destination(to), sockets.senders[to.name]) for to in change.program.senders}
 
@@ -198,7 +198,7 @@ class Sockets:
     def close_listeners(self) -> None:
         for listener in self.listeners.values():
             listener.close()
-        for opened in self._inherited:
+        for opened in self._of_head_start:
             opened.close()
 
     def close_senders(self) -> None:
