@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from socket import inet_ntoa
 from typing import Union, cast
 
-from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.threads import NativeThread
 from router.compiler.metrics import Answer, Evidence, Mismatch, Report
-from router.compiler.refusals import why_refused
+from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS, why_refused
 from router.declared import (
     NO_NAME,
     AnswerEvent,

@@ -11,9 +11,8 @@ from functools import cache
 from socket import inet_ntoa
 from typing import Any, Generic, TypeVar
 
-from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.ring import Ring
-from router.compiler.refusals import why_refused
+from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS, why_refused
 from router.datagrams import Peer
 from router.declared import NO_NAME, ROUTED, Action, ActionRecord, MirrorRecord
 from router.image.names import Names

@@ -7,14 +7,7 @@ from __future__ import annotations
 
 from router import datagrams
 from router.compiler.compiled_table import CompiledTable
-from router.declared import DropReason, Reason
 from router.table.model.endpoints import Framing
-
-REJECTIONS = tuple(reason.name.lower() for reason in Reason)
-"""The names of `metrics.REJECT_REASONS`, by `enum reason`."""
-
-DROP_REASON_NAMES = tuple(reason.name.lower() for reason in DropReason)
-"""The names of `metrics.DROP_REASONS`, by `enum drop_reason`."""
 
 
 def why_rejected(program: CompiledTable, listener: str, data: bytes, length: int) -> str:

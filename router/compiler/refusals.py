@@ -1,4 +1,4 @@
-"""Why the machine refuses a value, in words: `struct refusal` of `native/events.h`."""
+"""The carrier's reasons in words: their names, and why the machine refuses a value (`struct refusal` of `events.h`)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import struct
 from collections.abc import Callable, Mapping
 from functools import partial
 
+from router.declared import DropReason, Reason, Refused, Sign
 from router.declared import Refusal as NativeRefusal
-from router.declared import Refused, Sign
+
+REJECTIONS = tuple(reason.name.lower() for reason in Reason)
+"""The names of `metrics.REJECT_REASONS`, by `enum reason`."""
+
+DROP_REASON_NAMES = tuple(reason.name.lower() for reason in DropReason)
+"""The names of `metrics.DROP_REASONS`, by `enum drop_reason`."""
 
 
 def why_refused(refusal: NativeRefusal, text: bytes) -> str:

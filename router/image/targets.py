@@ -13,13 +13,12 @@ from router.compiler.compiled_table import STRANGER, CompiledTable, RoutePlan, s
 from router.compiler.lowering import LoweredCollect, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
+from router.compiler.refusals import DROP_REASON_NAMES
 from router.image.openings import Openings, period
 from router.table.model.targets import OnLimit, TargetKeys
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
-
-_DROP_REASONS = [reason.name.lower() for reason in c.DropReason]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ class TargetWriter:
         if target.is_topic and plan.collect_timeout is not None:
             written.collected = counters.index("messages_collected", *place)
         written.delivered = counters.index("messages_published" if target.is_topic else "datagrams_sent", *place)
-        written.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in _DROP_REASONS]
+        written.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in DROP_REASON_NAMES]
         if not target.is_topic:
             written.delivered_bytes = counters.index("sent_bytes", *place)
         written.period, written.priority = _held_period(target.declared), c.Priority[target.priority.name]

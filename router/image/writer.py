@@ -16,6 +16,7 @@ from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers, sent_from
+from router.compiler.refusals import REJECTIONS
 from router.declared import NONE
 from router.image.boards import write_boards
 from router.image.image import Image
@@ -25,8 +26,6 @@ from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer
 from router.image.wire_schema import write_schema
 from router.table.model.endpoints import Endpoint, EndpointKind, Framing
-
-_REJECT_REASONS = [reason.name.lower() for reason in c.Reason]
 
 
 def write_image(program: CompiledTable, names: Names | None = None) -> Image:
@@ -156,7 +155,7 @@ class _Writer:
             received_bytes=counters.index("received_bytes", name),
             padded=counters.index("datagrams_padded", name),
             superseded=counters.index("superseded_members", name),
-            rejected=tuple(counters.index("datagrams_rejected", name, reason) for reason in _REJECT_REASONS),
+            rejected=tuple(counters.index("datagrams_rejected", name, reason) for reason in REJECTIONS),
         )
 
     def _peers(self, listener: str) -> Iterator[c.Peer]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.owned import OwnedPointer, open_native
-from router.carrier.reasons import DROP_REASON_NAMES
+from router.compiler.refusals import DROP_REASON_NAMES
 from router.image.openings import period
 from router.table.model.targets import Priority
 from tests.carrier.building import MEMORY, sanitizing

@@ -12,10 +12,10 @@ from typing import NamedTuple, Union
 from router import declared as c
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.owned import OwnedPointer, open_native
-from router.carrier.reasons import DROP_REASON_NAMES
 from router.compiler.lowering import LoweredFeed, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
+from router.compiler.refusals import DROP_REASON_NAMES
 from router.declared import NONE
 from router.image.targets import write_collect
 from router.image.writer import write_for_each

@@ -15,8 +15,8 @@ import pytest
 from router import declared
 from router.carrier import build
 from router.carrier.headers import HeaderError, checks, declarations
-from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
+from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS
 from router.table.model.targets import Priority
 
 HEADER = """

@@ -13,11 +13,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.carrier.events import CountedReport, EventReader
-from router.carrier.reasons import DROP_REASON_NAMES, REJECTIONS
 from router.carrier.simulation import Simulation
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import DROP_REASONS, INTENDED_REASONS, REJECT_REASONS, Report
-from router.compiler.refusals import _WORDS
+from router.compiler.refusals import _WORDS, DROP_REASON_NAMES, REJECTIONS
 from router.datagrams import wire_of_protos
 from router.declared import EventKind, LostEvent, Refused
 from router.image.names import Names
