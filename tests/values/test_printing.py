@@ -6,7 +6,6 @@ import json
 import math
 import struct
 from datetime import datetime, timedelta, timezone
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Imu, LaserScan
 from std_msgs.msg import Byte, ByteMultiArray, Empty, Header, String
 
-from router.datagrams import wire_of_protos
 from router.types.protobuf import PayloadCase
 from router.values.printing import (
     clock_text,
@@ -30,13 +28,6 @@ from router.values.printing import (
     words,
 )
 from tests import everything
-
-PROTOS = Path(__file__).parents[1] / "protos"
-
-
-@pytest.fixture(scope="module")
-def every_kind() -> PayloadCase:
-    return wire_of_protos(PROTOS).case("every_kind")
 
 
 @pytest.mark.parametrize(

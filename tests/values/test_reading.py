@@ -22,13 +22,6 @@ from router.values.printing import (
 from router.values.reading import payload
 from tests import everything
 
-PROTOS = Path(__file__).parents[1] / "protos"
-
-
-@pytest.fixture(scope="module")
-def every_kind() -> PayloadCase:
-    return wire_of_protos(PROTOS).case("every_kind")
-
 
 def build(case: PayloadCase, *words: str) -> Any:
     return payload(case, words)
