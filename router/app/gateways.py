@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from router.app.change import Change
@@ -17,15 +18,26 @@ if TYPE_CHECKING:
 
 
 class Gateways:
-    """Serves clients of the topics. `drops` follows what the kernel drops, `refused` counts refused connections."""
+    """Serves clients of the topics. `drops` follows what the kernel drops, `refused` counts refused connections.
 
-    def __init__(self, topics: Topics, drops: KernelDrops, counts: ThreadCounts, reporter: Reporter) -> None:
+    `publish_newest` wakes the thread that publishes datagrams.
+    """
+
+    def __init__(
+        self,
+        topics: Topics,
+        drops: KernelDrops,
+        counts: ThreadCounts,
+        reporter: Reporter,
+        publish_newest: Callable[[], None],
+    ) -> None:
         self.thread: GatewayThread | None = None
         self.refused: Counter[str] = Counter()
         self._topics = topics
         self._drops = drops
         self._counts = counts
         self._reporter = reporter
+        self._publish_newest = publish_newest
 
     # adoption of another program
 
@@ -68,7 +80,13 @@ class Gateways:
         assert self._topics.node is not None  # noqa: S101 - gateways need topics, which are open
         reporter = self._reporter
         return GatewayThread(
-            self._topics.node, library(), self._counts.gateways, reporter.report, reporter.failed, self.refused
+            self._topics.node,
+            library(),
+            self._counts.gateways,
+            reporter.report,
+            reporter.failed,
+            self.refused,
+            self._publish_newest,
         )
 
     def close(self) -> None:

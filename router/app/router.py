@@ -321,8 +321,8 @@ class Services:
         if diagnostics is not None:
             from router.observe.diagnostics import Diagnostics
 
-            publish, wanted = diagnostics.publish, diagnostics.wanted
-            opening.callback(Diagnostics(health, node, publish, lambda: bool(wanted[0])).close)
+            publish, demand = diagnostics.publish, diagnostics.demand
+            opening.callback(Diagnostics(health, node, publish, lambda: bool(demand.wanted)).close)
         if table.http is not None:
             from router.observe.http import HttpServer
 

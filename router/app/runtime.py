@@ -61,7 +61,7 @@ class Runtime:
         self.counts = plane.counts
         self.sockets = Sockets(self.drops, plane.library, head_start)
         self.topics = Topics(ros_args, self._note_incompatible, plane.subscriber_joined)
-        self.gateways = Gateways(self.topics, self.drops, self.counts, reporter)
+        self.gateways = Gateways(self.topics, self.drops, self.counts, reporter, forwarding.published.wake)
         self._images = Images(forwarding, head_start)
         self._unfinished: list[Change] = []
 

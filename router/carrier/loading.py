@@ -31,7 +31,7 @@ if TYPE_CHECKING:
         """The protocol of `ros.endpoints.Publication`. Several threads may publish at once, until it is closed."""
 
         @property
-        def wanted(self) -> ctypes.Array[Any]: ...
+        def demand(self) -> c.Demand: ...
 
     class Listening(Protocol):
         """A listener: `net.sockets.ListeningSocket`, or what has one."""
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 
 _WORD = 8
-_WANTED, _UNWANTED = (ctypes.c_uint8 * 1)(1), (ctypes.c_uint8 * 1)(0)
-"""The byte `wanted` of a topic that is not open: serving late joiners, it gets its messages later."""
+_WANTED, _UNWANTED = c.Demand(wanted=c.Wanted.EVERY_MESSAGE), c.Demand()
+"""The demand of a topic that is not open: serving late joiners, it gets its messages later."""
 
 
 class LoadedImage:
@@ -85,7 +85,7 @@ class LoadedImage:
         for symbol in self._places:
             self._set(symbol, self._address(symbol))
         for topic, serves_late_joiners in image.topics:
-            self._set(("wanted", topic), ctypes.addressof(_WANTED if serves_late_joiners else _UNWANTED))
+            self._set(("demand", topic), ctypes.addressof(_WANTED if serves_late_joiners else _UNWANTED))
         self.program = self.at(c.Program, image.program)
 
     def _copy(self) -> None:
@@ -151,7 +151,7 @@ class LoadedImage:
             if topic in publications:
                 self._objects["publisher", topic] = publications[topic]
                 self._set(("publisher", topic), publications[topic].address)
-                self._set(("wanted", topic), ctypes.addressof(publications[topic].wanted))
+                self._set(("demand", topic), ctypes.addressof(publications[topic].demand))
 
     def open_client_deadmen(self, timers: int) -> None:
         """Open the deadmen of gateway clients in this group, once their topics are bound. Raises MemoryError."""

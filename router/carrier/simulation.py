@@ -222,7 +222,7 @@ class _Topic:
     """A topic with a subscriber. Stands for `ros.endpoints.Publication`."""
 
     address = 0
-    wanted = (ctypes.c_uint8 * 1)(1)
+    demand = c.Demand(wanted=c.Wanted.EVERY_MESSAGE)
 
 
 _TOPIC = _Topic()

@@ -17,12 +17,13 @@ _CANCEL_AGAIN_S = 0.1
 class GatewayContext:
     """`converting` converts large messages from ROS, which would block the loop.
 
-    `failed` reports faults of the router itself. Clocks in ns.
+    `failed` reports faults of the router itself, `publish_newest` publishes what topics were asked for. Clocks in ns.
     """
 
     subscriptions: Subscriptions
     converting: Executor
     failed: Callable[[Exception], None]
+    publish_newest: Callable[[], None]
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]
 

@@ -104,6 +104,10 @@ class TopicSubscription:
     def is_used(self) -> bool:
         return self._users > 0
 
+    def ask(self) -> bool:
+        """Ask for a message newer than the `latest` one. Return whether it comes only after `publish_newest`."""
+        return self._tap is not None and self._tap.ask()
+
     def latest(self) -> Sample | None:
         """Return the newest message. Without callbacks, take waiting messages first."""
         if not self._callbacks:

@@ -68,7 +68,7 @@ class GatewayThread:
     `prepare` opens new gateways, `adopt` closes obsolete ones, `finish` starts the new services; `undo` undoes the
     change instead. `library` is the carrier's. `counts` belong to this thread, which calls all callbacks.
     `kernel_drops` has, for each gateway that receives datagrams, a thread-safe function that returns how many the
-    kernel has dropped. `refused` counts refused connections (see Door).
+    kernel has dropped. `refused` counts refused connections (see Door). `publish_newest`: see GatewayContext.
     """
 
     def __init__(
@@ -79,6 +79,7 @@ class GatewayThread:
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
         refused: Counter[str],
+        publish_newest: Callable[[], None],
     ) -> None:
         self.kernel_drops: dict[str, Callable[[], int]] = {}
         self._failed = failed
@@ -93,7 +94,9 @@ class GatewayThread:
         self._thread = Thread(self._loop.run_forever, "gateway")
         self._services: dict[str, GatewayService] = {}
         self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
-        self._context = GatewayContext(self._subscriptions, self._converting, failed, boottime_ns, wall_ns)
+        self._context = GatewayContext(
+            self._subscriptions, self._converting, failed, publish_newest, boottime_ns, wall_ns
+        )
         self._thread.start()
 
     def prepare(self, program: CompiledTable, feed: Mapping[str, Callable[[int], None]]) -> GatewayChange:

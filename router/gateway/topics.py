@@ -42,6 +42,9 @@ DRAIN_S, SHOW_S = 1.0, 10.0
 SHORTEST_TURN = 10_000_000
 """The minimum time between turns, ns: shorter ones cost more than they gain."""
 
+PUBLISHED_S = 0.002
+"""How long to wait for messages that the router publishes when its gateways ask; later ones are sent a turn later."""
+
 MOST_NAMED = 5
 """Maximum topics that a line of the log names."""
 
@@ -67,6 +70,7 @@ class Topics:
         self._name = plan.settings.name
         self._plan = plan
         self._subscriptions = context.subscriptions
+        self._publish_newest = context.publish_newest
         self._failed = context.failed
         self._sender = sender
         self._counters = counters
@@ -229,7 +233,12 @@ class Topics:
 
     async def _publish(self, period: int, due: Sequence[ServedTopic]) -> None:
         frames: list[Frame] = []
-        for number, served in enumerate([served for served in due if served.period == period], 1):
+        due = [served for served in due if served.period == period]
+        asked = [served for served in due if self._clients and served.subscription.ask()]
+        if asked:
+            self._publish_newest()
+            await asyncio.sleep(min(PUBLISHED_S, period / 4e9))
+        for number, served in enumerate(due, 1):
             try:
                 self._sender.poll(served, frames)
             except Exception as error:  # noqa: BLE001 reported; other topics are still served

@@ -111,7 +111,10 @@ class TargetWriter:
     def _topic(self, topic: str) -> c.Target:
         if topic not in self._topics:
             address = self.openings.symbols.address
-            written = c.Topic(publisher=address("publisher", topic), wanted=address("wanted", topic))
+            written = c.Topic(
+                publisher=address("publisher", topic),
+                demand=ctypes.cast(address("demand", topic), ctypes.POINTER(c.Demand)),
+            )
             self._topics[topic] = self.arrays.add(written)
         return c.Target(topic=ctypes.pointer(self._topics[topic]))
 

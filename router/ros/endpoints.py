@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from threading import get_ident
+from threading import Lock, get_ident
 from time import sleep
 from typing import TypeVar
 
@@ -17,9 +17,10 @@ from rclpy.node import Node
 
 from router.clock import monotonic_ns
 from router.compiler.compiled_table import TopicPlan
+from router.declared import Demand, Wanted
 from router.errors import ConfigurationError, SourceSpan
 from router.log import logger
-from router.ros.events import PeerEvents, WantedFlag
+from router.ros.events import PeerEvents
 from router.ros.marks import Mark
 from router.ros.node import RCL_ERRORS, start_error
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
@@ -53,7 +54,7 @@ def _rcl_error() -> Exception:
 
 
 class Publication:
-    """A publisher. `wanted` says whether it has subscribers or serves late joiners, `subscribers` how many it has.
+    """A publisher. `subscribers` is how many it has, `demand` what they want; native threads read it by its address.
 
     `publish` takes CDR bytes, is thread-safe, and releases the interpreter lock while the middleware works. It raises
     RCLError if the middleware fails or the publisher is closed.
@@ -62,8 +63,10 @@ class Publication:
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
         """Open the publisher. Raises StartError if the middleware refuses it."""
         self.plan = plan
-        self.wanted: WantedFlag = (ctypes.c_uint8 * 1)(plan.qos.serves_late_joiners)
+        self.demand = Demand(wanted=Wanted.EVERY_MESSAGE if plan.qos.serves_late_joiners else Wanted.NOTHING)
         self.subscribers = 0
+        self._samplers = 0
+        self._lock = Lock()  # of these three
         with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
             self._publisher = node.create_publisher(
                 message,
@@ -86,8 +89,22 @@ class Publication:
         self.events: Sequence[EventHandler] = self._publisher.event_handlers
 
     def _matched(self, subscribers: int) -> None:
+        with self._lock:
+            self._note(subscribers)
+
+    def note_samplers(self, change: int) -> None:
+        """Count subscriptions of this process that want only the newest message, when `demand.is_due`."""
+        with self._lock:
+            self._samplers += change
+            if not self._is_closed:
+                self._note(self._publisher.get_subscription_count())
+
+    def _note(self, subscribers: int) -> None:
         self.subscribers = subscribers
-        self.wanted[0] = subscribers > 0 or self.plan.qos.serves_late_joiners
+        if self.plan.qos.serves_late_joiners or subscribers > self._samplers:
+            self.demand.wanted = Wanted.EVERY_MESSAGE
+        else:
+            self.demand.wanted = Wanted.NEWEST_MESSAGE if subscribers else Wanted.NOTHING
 
     def await_subscribers(self) -> None:
         """Wait up to 0.5 s until subscribers of an earlier publisher of the topic have discovered this one."""
@@ -134,7 +151,8 @@ class Publication:
 
         Waits up to CLOSING_S for running calls. No thread may be waiting for its events.
         """
-        self._is_closed = True
+        with self._lock:
+            self._is_closed = True
         for _ in range(int(CLOSING_S / _POLL_S)):
             if not self._calls:
                 break

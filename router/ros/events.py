@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.guard_condition import GuardCondition
@@ -38,10 +37,6 @@ SubscriberJoined = Callable[[str], None]
 _MORE_CHECKS = 10
 """Checks of a topic after its last incompatible peer: a middleware may report the event before the peer is in its
 graph."""
-
-
-WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
-"""One byte, nonzero while a topic has subscribers or serves late joiners. Native threads read it by its address."""
 
 
 class PeerEvents:

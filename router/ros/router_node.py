@@ -9,9 +9,10 @@ from functools import partial
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.compiled_table import TopicPlan
+from router.declared import Demand
 from router.errors import SourceSpan
 from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
-from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
+from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined
 from router.ros.graph import GraphWatch, Ours, Surroundings
 from router.ros.marks import Mark
 from router.ros.node import close_node, open_node
@@ -47,10 +48,11 @@ class RouterNode:
         subscriber_joined: SubscriberJoined = lambda _: None,
     ) -> None:
         self.publish: dict[str, Callable[[bytes], None]] = {}
-        self.wanted: dict[str, WantedFlag] = {}
+        self.demands: dict[str, Demand] = {}
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._types: dict[str, str] = {}
+        self._published: dict[str, Publication] = {}  # by absolute name
         self._is_stuck = False
         self._is_abandoned = False  # a stuck thread uses subscriptions or publishers
         self._peers = PeerEvents(incompatible, subscriber_joined)
@@ -62,7 +64,7 @@ class RouterNode:
             opening.callback(Mark(self._node, self._full_name).close)
             self._graph = GraphWatch(self._node)
             opening.callback(self._graph.close)
-            self.topics = RosTopics(self._node, self._types)
+            self.topics = RosTopics(self._node, self._types, self._published)
             opening.callback(self._close_topics)
             change = self.prepare(publishers, subscriptions, spans)
             self._use(change)
@@ -98,7 +100,7 @@ class RouterNode:
             opening.pop_all()
         for publication in published:
             earlier = self._publications.get(publication.plan.label)
-            if earlier is not None and earlier.wanted[0]:
+            if earlier is not None and earlier.demand.wanted:
                 publication.await_subscribers()
         for subscription in subscribed:
             if subscription.plan.label in self._subscriptions:
@@ -141,7 +143,7 @@ class RouterNode:
     def finish(self, change: RosChange) -> None:
         """Close unused endpoints; no thread may publish on them or wait for their events."""
         for topic in self.publish.keys() - self._publications.keys():
-            del self.publish[topic], self.wanted[topic]
+            del self.publish[topic], self.demands[topic]
         for opened in change.unused:
             self._close_one(opened)
 
@@ -152,10 +154,12 @@ class RouterNode:
             for endpoints in (change.subscriptions, change.publications)
         )
         self._ours = Ours(self._full_name, received, published)
+        self._published.clear()
+        self._published.update((publication.topic, publication) for publication in change.publications.values())
         self._types.clear()
         self._types.update((topic, plan.type_name) for topic, plan in (received | published).items())
         self.publish.update((topic, publication.publish) for topic, publication in change.publications.items())
-        self.wanted.update((topic, publication.wanted) for topic, publication in change.publications.items())
+        self.demands.update((topic, publication.demand) for topic, publication in change.publications.items())
 
     def _event_thread(self) -> EventThread:
         return EventThread(

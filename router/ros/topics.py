@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import islice
 from time import monotonic, sleep
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -16,7 +17,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from router.declared import Wanted
 from router.errors import StartError, TransportError
+from router.ros.endpoints import Publication
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import Arrivals, RawSubscription
 from router.ros.type_support import Definition
@@ -43,10 +46,16 @@ class DiscoveredPublisher(NamedTuple):
 
 
 class RosTopics:
-    """The topics that `node` has discovered. Names are absolute. `types` are those of the table's topics."""
+    """The topics that `node` has discovered. Names are absolute. `types` are those of the table's topics.
 
-    def __init__(self, node: Node, types: Mapping[str, str]) -> None:
+    `published` are the publishers of this process.
+    """
+
+    def __init__(
+        self, node: Node, types: Mapping[str, str], published: Mapping[str, Publication] = MappingProxyType({})
+    ) -> None:
         self.types = types
+        self._published = published
         self._node = node
         self._handle = node.handle
         self._name = node.get_name(), node.get_namespace()
@@ -108,9 +117,8 @@ class RosTopics:
                 )
             if others:  # DDS allows one type per topic in a process
                 raise StartError(f"topic '{topic}' is {others.pop()} in this router, so it cannot be {type_name}")
-            return TopicTap(
-                self._node, topic, message_class, tap_qos(is_reliable=is_reliable, keeps=keeps, depth=depth)
-            )
+            qos = tap_qos(is_reliable=is_reliable, keeps=keeps, depth=depth)
+            return TopicTap(self._node, topic, message_class, qos, self._published.get(topic) if depth == 1 else None)
         except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
 
@@ -126,10 +134,13 @@ class RosTopics:
 class TopicTap:
     """A polled subscription: messages that are not taken cost no time in Python. The caller must close it.
 
-    `fd` is readable while there are messages that `arrived` has not counted.
+    `fd` is readable while there are messages that `arrived` has not counted. `sampled` is a publisher of this process:
+    if it has no other subscribers, it publishes only after `ask`.
     """
 
-    def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
+    def __init__(
+        self, node: Node, topic: str, message_class: Any, qos: QoSProfile, sampled: Publication | None = None
+    ) -> None:
         """Subscribe to a topic. Raises one of `RCL_ERRORS`, or OSError if too many files are open."""
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         with ExitStack() as opening:
@@ -139,15 +150,33 @@ class TopicTap:
             opening.callback(subscription.close)
             subscription.announce_to(self.fd)  # reports earlier messages at once
             opening.callback(subscription.announce_to, None)
+            if sampled is not None:
+                self._replaced = sampled.demand.replaced
+                sampled.note_samplers(1)
+                opening.callback(sampled.note_samplers, -1)
             self._open = opening.pop_all()
+        self._sampled = sampled
         self.take = subscription.take
 
+    def ask(self) -> bool:
+        """Ask for the newest message, unless each one arrives anyway. Then wake the thread that publishes."""
+        if self._sampled is None or self._sampled.demand.wanted != Wanted.NEWEST_MESSAGE:
+            return False
+        self._sampled.demand.is_due = 1
+        return True
+
     def arrived(self) -> int:
-        """Return the number of messages that have arrived since the last call, taken or not. Does not wait."""
-        try:
-            return os.eventfd_read(self.fd)
-        except BlockingIOError:
-            return 0
+        """Return the number of messages that have arrived since the last call, taken or not. Does not wait.
+
+        Those count that the publisher replaced by newer ones before it was asked.
+        """
+        arrived = 0
+        if self._sampled is not None:
+            before, self._replaced = self._replaced, self._sampled.demand.replaced
+            arrived = self._replaced - before
+        with suppress(BlockingIOError):
+            arrived += os.eventfd_read(self.fd)
+        return arrived
 
     def close(self) -> None:
         self._open.close()

@@ -30,7 +30,7 @@ from tests.acceptance.gateway_clients import (
     scene,
     twist,
 )
-from tests.acceptance.payloads import generated
+from tests.acceptance.payloads import generated, sample
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import key, total, udp, wait_until
 from tests.repeating import repeating
@@ -451,3 +451,30 @@ def test_what_only_the_router_publishes_is_filled_while_a_client_is_there(tmp_pa
             wait_until(lambda: now.site.scrape()[filtered] >= 10, "what nobody wants")
         with Dashboard(now.ports["DASHBOARD"]) as client, repeating(send):
             assert client.next("data")["topic"] == "/imu_data"
+
+
+def test_of_what_only_the_router_publishes_each_period_has_the_newest_value_and_all_are_counted(tmp_path: Path) -> None:
+    payload, sent = next(generated("imu_info")).payload, 0
+
+    def send(to: Scene) -> None:
+        nonlocal sent
+        sent += 1
+        payload.accel_x = sent
+        to.site.send("sensor_board", sample("imu_info", payload).datagram)
+
+    def counts(of: Scene) -> tuple[float, float]:
+        found = of.site.scrape()
+        published = found[key("messages_published", route="imu_info", topic="imu_data")]
+        return published, found[key("messages_received", route="dashboard", source="ros")]
+
+    gateway = IMU_ONLY.replace("50ms", "300ms")
+    with scene(tmp_path, gateway, "DASHBOARD") as now, Dashboard(now.ports["DASHBOARD"]) as client:
+        with repeating(partial(send, now), 0.005):
+            values = [client.next("data")["data"]["accel_x"] for _ in range(3)]
+            rates = [client.next("topics")["topics"][0]["rate"] for _ in range(3)]
+        while values[-1] != sent:
+            values.append(client.next("data")["data"]["accel_x"])
+        assert values == sorted(values)
+        assert rates[-1] > 10  # messages come much more often than values are sent
+        wait_until(lambda: len({*counts(now)}) == 1, "the count of all that was published")
+        assert counts(now)[0] > 2 * len(values)

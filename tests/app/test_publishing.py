@@ -40,7 +40,7 @@ def await_subscriber(router: Router, subscriber: Subscriber) -> None:
     ros = router._runtime.topics.node
     assert ros is not None
     assert subscriber.line() == "matched"
-    wait_until(lambda: ros.wanted["published_ph"][0])
+    wait_until(lambda: ros.demands["published_ph"].wanted)
 
 
 def number(line: str) -> float:

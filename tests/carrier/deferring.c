@@ -91,7 +91,9 @@ static void give_up(void) {
     }
 }
 
-static enum publication publish_noted(struct thread_env *env, const struct target *target, const char **why) {
+static enum publication publish_noted(struct thread_env *env, const struct targets *to, const struct target *target,
+                                      const char **why) {
+    (void)to;
     *why = "refused";
     if (opened->is_given_up) {
         give_up();

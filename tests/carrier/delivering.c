@@ -43,7 +43,9 @@ static int note_sent(struct thread_env *env, const struct target *target, const 
     return !append(&of->bytes, data, size);
 }
 
-static enum publication note_published(struct thread_env *env, const struct target *target, const char **why) {
+static enum publication note_published(struct thread_env *env, const struct targets *to, const struct target *target,
+                                       const char **why) {
+    (void)to;
     struct output *written = &env->machine.output;
     *why = "";
     return note_sent(env, target, written->data, written->size, NEVER) ? PUBLISH_FAILED : PUBLISHED;

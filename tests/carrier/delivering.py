@@ -98,9 +98,9 @@ class Delivering:
         self._arrays = Arrays()
         self._counters = (c_int64 * (1 + (1 + len(self._lowered)) * _OF_TARGET))()
         routines = Routines(lowered.layout, self._arrays)
-        wanted, is_from_ros = (ctypes.c_uint8 * 1)(1), isinstance(lowered, LoweredFeed)
-        topic = c.Topic(wanted=ctypes.addressof(wanted))
-        self._held: list[object] = [wanted, topic]
+        demand, is_from_ros = c.Demand(wanted=c.Wanted.EVERY_MESSAGE), isinstance(lowered, LoweredFeed)
+        topic = c.Topic(demand=ctypes.pointer(demand))
+        self._held: list[object] = [demand, topic]
         targets = []
         for number, target in enumerate(self._lowered):
             first = 1 + number * _OF_TARGET

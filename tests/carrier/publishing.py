@@ -18,6 +18,7 @@ from router.carrier.loading import LoadedImage
 from router.carrier.publishing import PublishThread
 from router.carrier.ring import Ring
 from router.compiler.compiled_table import CompiledTable
+from router.declared import Demand, Wanted
 from router.image.names import Names
 from router.image.writer import write_image
 from tests.small_tables import Ledger
@@ -33,7 +34,7 @@ class Publisher:
     def __init__(self, functions: ctypes.CDLL) -> None:
         self._functions = functions
         self.address: int = functions.middleware_advertise()
-        self.wanted = (ctypes.c_uint8 * 1)(1)
+        self.demand = Demand(wanted=Wanted.EVERY_MESSAGE)
 
     def impede(self, *, is_stuck: bool = False, delay_us: int = 0, refusal: str = "") -> None:
         """Make publishing block, take this long, or fail; without arguments, make it succeed at once."""
@@ -110,6 +111,10 @@ class Publishing:
     def _change_topics(self) -> None:
         before = self._programs[-2] if len(self._programs) > 1 else None
         self.thread.change(self._programs[-1].topic_change(before))
+
+    def publish_due(self) -> None:
+        """Have the thread publish the newest messages that are due."""
+        self._ring.wake()
 
     def stop_receiving(self) -> None:
         self._carrier.stop_receiving()

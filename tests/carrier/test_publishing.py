@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from time import sleep
+from typing import Any
 
 import pytest
 
+from router.declared import Wanted
 from tests.carrier.building import MEMORY, RACES, run_program
-from tests.carrier.publishing import Publishing, wait_until
+from tests.carrier.publishing import Publisher, Publishing, wait_until
 from tests.carrier.serving_ros import middleware
 from tests.carrier.simulated import START, Simulated
 from tests.small_tables import STRANGER, enveloped, program
@@ -88,7 +90,7 @@ def compare(publishing: Publishing, *datagrams: bytes, listener: str = "exact") 
         staged.simulation.datagram(listener, STRANGER, datagram, START)
     publishing.send(*datagrams, listener=listener)
     wait_until(lambda: not publishing.count("messages_waiting"))
-    unwanted = {topic for topic, each in publishing.publishers.items() if not each.wanted[0]}
+    unwanted = {topic for topic, each in publishing.publishers.items() if not each.demand.wanted}
     for topic, publisher in publishing.publishers.items():
         assert publisher.published() == ([] if topic in unwanted else staged.to(topic))
     found, expected = (
@@ -106,7 +108,7 @@ def compare(publishing: Publishing, *datagrams: bytes, listener: str = "exact") 
 
 def test_each_message_comes_to_what_it_comes_to_on_the_stage(opened: Open) -> None:
     publishing = opened()
-    publishing.publishers["position"].wanted[0] = 0
+    publishing.publishers["position"].demand.wanted = 0
     compare(
         publishing, imu(), imu(2.5), imu(y=0.0), imu(z=math.nan), imu(z=math.inf), imu(x=1000.0, y=0.0), gps(), gps(7.5)
     )
@@ -129,7 +131,7 @@ def test_nobody_wants_a_topic_for_a_while(opened: Open) -> None:
     publishing = opened(SHORT_LIVED.replace("1ms", "1h"))
     accel = publishing.publishers["accel"]
     for turn in range(40):
-        accel.wanted[0] = turn // 10 % 2
+        accel.demand.wanted = turn // 10 % 2
         publishing.send(imu(float(turn)))
         wait_until(lambda: not publishing.count("messages_waiting"))
     assert [number(cdr) for cdr in accel.published()] == [*range(10, 20), *range(30, 40)]
@@ -142,7 +144,7 @@ def test_what_waits_for_a_topic_that_nobody_wants_any_more_is_filtered(opened: O
     accel, position = publishing.publishers["accel"], publishing.publishers["position"]
     position.impede(is_stuck=True)
     publishing.send(gps(), imu(), imu())
-    accel.wanted[0] = 0
+    accel.demand.wanted = 0
     position.impede()
     wait_until(lambda: not publishing.count("messages_waiting"))
     assert accel.count == 0
@@ -179,6 +181,102 @@ def test_a_middleware_that_refuses_says_why(opened: Open) -> None:
     assert publishing.losses() == [("imu_info", "accel", PUBLISH_ERROR, reason[:255]) for reason in reasons]
     assert publishing.count("messages_dropped", "imu_info", "accel", "publish_error") == 3
     assert [number(cdr) for cdr in accel.published()] == [4.0]
+    check_books(publishing)
+
+
+# ---- subscribers that want only the newest message
+
+
+def sampled(opened: Open, *arguments: Any) -> tuple[Publishing, Publisher]:
+    publishing = opened(*arguments)
+    for publisher in publishing.publishers.values():
+        publisher.demand.wanted = Wanted.NEWEST_MESSAGE
+    return publishing, publishing.publishers["position"]
+
+
+def test_the_newest_message_is_published_once_it_is_due(opened: Open) -> None:
+    publishing, position = sampled(opened)
+    publishing.send(*map(gps, (1.0, 2.0, 3.0)))
+    publishing.publish_due()
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert position.count == 0
+    position.demand.is_due = 1
+    publishing.publish_due()
+    wait_until(lambda: not position.demand.is_due)
+    assert [number(cdr) for cdr in position.published()] == [3.0]
+    assert position.demand.replaced == 2
+    assert publishing.count("messages_published", "gps_info", "position") == 3
+    assert publishing.publishers["accel"].count == 0
+    check_books(publishing)
+
+
+def test_messages_wait_in_the_queue_while_it_has_room(opened: Open) -> None:
+    publishing, position = sampled(opened, ROUTES, 1 << 12)
+    publishing.send(gps())
+    sleep(0.05)
+    assert publishing.count("messages_waiting", "gps_info", "position") == 1
+    publishing.send(*(gps(float(turn)) for turn in range(200)))
+    assert publishing.count("messages_dropped") == 0
+    position.demand.is_due = 1
+    publishing.publish_due()
+    wait_until(lambda: position.count == 1)
+    assert [number(cdr) for cdr in position.published()] == [199.0]
+
+
+def test_the_newest_of_those_that_meet_the_condition_counts(opened: Open) -> None:
+    publishing, _ = sampled(opened)
+    inverse = publishing.publishers["inverse"]
+    publishing.send(imu(1.0, y=2.0), imu(1000.0, y=4.0))
+    inverse.demand.is_due = 1
+    publishing.publish_due()
+    wait_until(lambda: inverse.count == 1)
+    assert [number(cdr) for cdr in inverse.published()] == [0.5]
+
+
+def test_a_message_with_a_ttl_does_not_wait(opened: Open) -> None:
+    publishing, _ = sampled(
+        opened, ROUTES.replace("topics: [{topic: position", "ttl: 1h\n    topics: [{topic: position")
+    )
+    publishing.send(gps())
+    wait_until(lambda: not publishing.count("messages_waiting"))
+
+
+def test_a_held_message_does_not_follow_a_newer_one(opened: Open) -> None:
+    publishing, position = sampled(opened)
+    publishing.send(gps(1.0))
+    publishing.publish_due()
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    position.demand.wanted = Wanted.EVERY_MESSAGE
+    publishing.send(gps(2.0), gps(3.0))
+    wait_until(lambda: position.count == 2)
+    position.demand.is_due = 1
+    publishing.publish_due()
+    sleep(0.05)
+    assert [number(cdr) for cdr in position.published()] == [2.0, 3.0]
+    assert position.demand.replaced == 1
+
+
+@pytest.mark.parametrize("end", [lambda publishing: publishing.change(2), lambda publishing: publishing.thread.stop()])
+def test_the_newest_message_is_published_before_a_change_or_stop(
+    opened: Open, end: Callable[[Publishing], object]
+) -> None:
+    publishing, position = sampled(opened)
+    publishing.send(gps(1.0), gps(2.0))
+    end(publishing)
+    wait_until(lambda: position.count == 1)
+    assert [number(cdr) for cdr in position.published()] == [2.0]
+    check_books(publishing)
+
+
+def test_a_newest_message_that_the_middleware_refuses_is_counted(opened: Open) -> None:
+    publishing, position = sampled(opened)
+    position.impede(refusal="there is no room")
+    publishing.send(gps())
+    position.demand.is_due = 1
+    publishing.publish_due()
+    publishing.wait_for("messages_dropped", 1)
+    assert publishing.losses() == [("gps_info", "position", PUBLISH_ERROR, "there is no room")]
+    assert publishing.count("messages_published", "gps_info", "position") == 0
     check_books(publishing)
 
 
@@ -396,7 +494,7 @@ def fates_of(publishing: Publishing, topic: str = "accel") -> dict[str, int]:
 
 def test_a_frame_is_published_when_it_is_complete(opened: Open) -> None:
     publishing = opened(LONG)
-    publishing.publishers["unwanted"].wanted[0] = 0
+    publishing.publishers["unwanted"].demand.wanted = 0
     publishing.send(of_frame(2), of_frame(0), of_frame(0), of_frame(1))
     served(publishing)
     assert [number(cdr) for cdr in publishing.publishers["accel"].published()] == [22.0]
@@ -409,10 +507,10 @@ def test_a_frame_is_collected_while_nobody_wants_its_topic(opened: Open) -> None
     """Somebody may, until it is complete."""
     publishing = opened(LONG)
     for publisher in publishing.publishers.values():
-        publisher.wanted[0] = 0
+        publisher.demand.wanted = 0
     publishing.send(of_frame(2), of_frame(0))
     served(publishing)
-    publishing.publishers["accel"].wanted[0] = 1
+    publishing.publishers["accel"].demand.wanted = 1
     publishing.send(of_frame(1))
     served(publishing)
     assert publishing.publishers["accel"].count == 1

@@ -70,6 +70,9 @@ class Tap:
         except BlockingIOError:
             return 0
 
+    def ask(self) -> bool:
+        return False
+
     def take(self) -> tuple[bytes, int] | None:
         return (self._waiting.popleft(), wall_ns()) if self._waiting else None
 
@@ -175,7 +178,7 @@ class Stage:
         loop.set_exception_handler(lambda _, context: self.faults.append(context["exception"]))
         subscriptions = Subscriptions(cast("RosTopics", self._graph), INTERFACES, loop)
         self._closing.callback(subscriptions.close)
-        self.context = GatewayContext(subscriptions, worker, self.faults.append, boottime_ns, wall_ns)
+        self.context = GatewayContext(subscriptions, worker, self.faults.append, lambda: None, boottime_ns, wall_ns)
         self.played = {plan.settings.name: Played(self, plan) for plan in self._plans}
         return self
 

@@ -34,7 +34,7 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path,
     picture = png(320, 240, (0, 128, 255))
     message = CompressedImage(format="png", data=list(picture))
     with closing(open_ros()) as ros, closing(Publisher("camera/compressed", IMAGE)) as publisher:
-        gateways = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter())
+        gateways = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter(), lambda: None)
         gateways.finish(gateways.prepare(made, {}))
         try:
             page = browser.open(f"http://127.0.0.1:{port}/?topic=/camera/compressed")

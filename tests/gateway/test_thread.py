@@ -24,7 +24,7 @@ from tests.ports import free_port
 
 def opened(made: CompiledTable) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
-    thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter())
+    thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter(), lambda: None)
     try:
         thread.finish(thread.prepare(made, {}))
     except BaseException:

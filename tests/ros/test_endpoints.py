@@ -38,9 +38,9 @@ def test_what_is_the_same_stays_open_and_what_is_not_wanted_closes() -> None:
         kept = ros.publish["greeting"]
         publish(ros, string_topic(), string_topic(topic="farewell"))
         assert ros.publish["greeting"] is kept
-        assert set(ros.wanted) == {"greeting", "farewell"}
+        assert set(ros.demands) == {"greeting", "farewell"}
         publish(ros, string_topic(topic="farewell"))
-        assert list(ros.publish) == list(ros.wanted) == ["farewell"]
+        assert list(ros.publish) == list(ros.demands) == ["farewell"]
         wait_until(lambda: not ros.topics.publishers("/greeting"))
 
 

@@ -109,7 +109,7 @@ def test_messages_that_nobody_has_taken_yet_leave_the_thread_of_events_asleep(
 def test_a_topic_may_be_published_and_subscribed_to() -> None:
     both = string_topic()
     with closing(open_ros(both)) as ros, Receiver(both) as receiver:
-        wait_until(lambda: ros.wanted["greeting"][0])
+        wait_until(lambda: ros.demands["greeting"].wanted)
         ros.publish["greeting"](HELLO)
         wait_until(lambda: receiver.messages() == [HELLO])
 

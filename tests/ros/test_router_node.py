@@ -48,15 +48,15 @@ def subscribe() -> Iterator[Callable[..., Subscriber]]:
 
 def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic())) as ros:
-        wanted = ros.wanted["greeting"]
-        assert wanted[0] == 0
+        demand = ros.demands["greeting"]
+        assert demand.wanted == 0
         peer = subscribe("greeting", "std_msgs/msg/String")
-        wait_until(lambda: wanted[0])
+        wait_until(lambda: demand.wanted)
         assert peer.line() == "matched"
         ros.publish["greeting"](HELLO)
         assert bytes.fromhex(peer.line()) == HELLO
         peer.close()
-        wait_until(lambda: not wanted[0])
+        wait_until(lambda: not demand.wanted)
 
 
 @pytest.mark.parametrize("args", [(), ("--ros-args", "-p", "start_type_description_service:=true")])
@@ -67,11 +67,11 @@ def test_there_is_no_service_that_nobody_would_answer(args: tuple[str, ...]) -> 
 
 def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
-        assert ros.wanted["greeting"][0] == 1
+        assert ros.demands["greeting"].wanted == 1
         ros.publish["greeting"](HELLO)
         peer = subscribe("greeting", "std_msgs/msg/String", "--transient-local")
         assert {peer.line(), peer.line()} == {"matched", HELLO.hex()}
-        assert ros.wanted["greeting"][0] == 1
+        assert ros.demands["greeting"].wanted == 1
 
 
 BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 5)
@@ -101,7 +101,7 @@ def test_peers_are_counted_by_policy_until_they_have_gone(subscribe: Callable[..
         one.close()
         apart.wait_for()
         subscribe("greeting", STRING, "--best-effort")  # it comes back as it should be
-        wait_until(lambda: ros.wanted["greeting"][0])
+        wait_until(lambda: ros.demands["greeting"].wanted)
         apart.wait_for()
         subscribe("greeting", STRING)
         apart.wait_for("reliability")
@@ -198,7 +198,7 @@ def test_a_fault_in_counting_an_event_is_told_and_costs_that_event_alone(subscri
         subscribe("greeting", "std_msgs/msg/String")
         wait_until(lambda: len(logged) == 2)
         subscribe("farewell", "std_msgs/msg/String")
-        wait_until(lambda: ros.wanted["farewell"][0])
+        wait_until(lambda: ros.demands["farewell"].wanted)
     assert [line["log_level"] for line in logged] == ["warning", "critical"]
 
 
@@ -214,7 +214,7 @@ def test_ros_that_others_shut_down_is_told_of() -> None:
 def test_ros_arguments_rename_topics(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(), args=("--ros-args", "-r", "greeting:=salute"))) as ros:
         peer = subscribe("salute", "std_msgs/msg/String")
-        wait_until(lambda: ros.wanted["greeting"][0])
+        wait_until(lambda: ros.demands["greeting"].wanted)
         assert peer.line() == "matched"
 
 
@@ -312,7 +312,7 @@ def blocked() -> Iterator[RouterNode]:
         peer = Subscriber("greeting", "std_msgs/msg/String")
         try:
             assert peer.line() == "matched"
-            wait_until(lambda: ros.wanted["greeting"][0])
+            wait_until(lambda: ros.demands["greeting"].wanted)
             peer.process.send_signal(signal.SIGSTOP)
             with suppress(*ros.publish_errors):
                 while True:
@@ -370,7 +370,7 @@ from tests.ros.opening import HELLO, open_ros, string_topic
 ros = open_ros(string_topic())
 with open("/proc/self/maps") as maps:
     print(sum("/dev/shm/fastrtps" in line for line in maps), flush=True)
-while not ros.wanted["greeting"][0]:
+while not ros.demands["greeting"].wanted:
     pass
 sys.stdin.readline()
 ros.publish["greeting"](HELLO)

@@ -13,12 +13,13 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
+from router.declared import Wanted
 from router.errors import StartError
 from router.ros import receiving
 from router.ros.router_node import RouterNode
 from router.ros.topics import DiscoveredPublisher, TopicListener, TopicTap
-from tests.ros.opening import STRING, cdr, open_ros
-from tests.ros.peers import Publisher, wait_until
+from tests.ros.opening import STRING, cdr, open_ros, string_topic
+from tests.ros.peers import Publisher, Subscriber, wait_until
 
 Publish = Callable[..., Publisher]
 
@@ -37,9 +38,9 @@ def ros() -> Iterator[RouterNode]:
         yield edge
 
 
-def tapped(ros: RouterNode, topic: str = "/greeting", *, keeps: bool = False) -> TopicTap:
+def tapped(ros: RouterNode, topic: str = "/greeting", *, keeps: bool = False, depth: int = 1) -> TopicTap:
     message_class = ros.topics.load(STRING, {STRING: (("data", "string"),)})
-    return ros.topics.tap(topic, message_class, is_reliable=True, keeps=keeps, depth=1)
+    return ros.topics.tap(topic, message_class, is_reliable=True, keeps=keeps, depth=depth)
 
 
 def test_publishers_are_seen_with_type_and_qos(ros: RouterNode, publisher: Publish) -> None:
@@ -153,3 +154,22 @@ def test_nothing_comes_when_nobody_publishes() -> None:
 def test_what_cannot_be_listened_to_is_refused(topic: str, type_name: str | None, complaint: str) -> None:
     with pytest.raises(StartError, match=complaint):
         TopicListener(topic, type_name)
+
+
+def test_a_topic_that_is_only_tapped_for_its_newest_message_is_published_when_asked() -> None:
+    with closing(open_ros(string_topic())) as ros:
+        demand = ros.demands["greeting"]
+        with closing(tapped(ros)) as tap:
+            assert demand.wanted == Wanted.NEWEST_MESSAGE
+            assert tap.ask()
+            assert demand.is_due
+            demand.replaced += 5
+            assert (tap.arrived(), tap.arrived()) == (5, 0)
+            with closing(Subscriber("greeting", STRING)):
+                wait_until(lambda: demand.wanted == Wanted.EVERY_MESSAGE)
+                assert not tap.ask()
+            wait_until(lambda: demand.wanted == Wanted.NEWEST_MESSAGE)
+            with closing(tapped(ros, depth=100)):
+                wait_until(lambda: demand.wanted == Wanted.EVERY_MESSAGE)
+            wait_until(lambda: demand.wanted == Wanted.NEWEST_MESSAGE)
+        wait_until(lambda: demand.wanted == Wanted.NOTHING)

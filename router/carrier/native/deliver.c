@@ -104,7 +104,7 @@ static bool is_readable(const struct delivery *of) {
 
 static bool is_wanted(const struct delivery *of) {
     const struct topic *topic = of->target->topic;
-    if (!topic || __atomic_load_n(topic->wanted, __ATOMIC_RELAXED)) return true;
+    if (!topic || wanted_of(topic)) return true;
     count(of, of->target->filtered);
     return false;
 }
@@ -176,7 +176,7 @@ static void lose_unsent(struct thread_env *env, const struct targets *to, const 
 
 static bool publish_it(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now) {
     const char *why;
-    switch (env->publish(env, target, &why)) {
+    switch (env->publish(env, to, target, &why)) {
     case PUBLISHED: env_count(env, target->delivered, 1); return true;
     case PUBLISH_FAILED:
         lose_message(env, to, target, now, (struct lost_event){.reason = DROP_PUBLISH_ERROR}, why);

@@ -31,11 +31,29 @@
 
 /* ---- settings of the table ---- */
 
+enum wanted {
+    NOTHING,       /* no subscriber */
+    EVERY_MESSAGE,
+    NEWEST_MESSAGE /* all subscribers are gateways of this router that look only now and then: the newest is published then */
+};
+
+/* What the subscribers of a topic want. Belongs to the owner of its publisher. */
+struct demand {
+    uint8_t wanted;     /* enum wanted */
+    uint8_t is_due;     /* with NEWEST_MESSAGE: set by a gateway that will look, and cleared once it may */
+    uint64_t replaced;  /* messages that newer ones replaced before they were published */
+    struct held *held;  /* the newest message; for the publish thread */
+};
+
 /* A topic that any number of routes publish on. */
 struct topic {
     const void *publisher; /* rcl_publisher_t */
-    const uint8_t *wanted; /* nonzero while there are subscribers */
+    struct demand *demand;
 };
+
+static inline uint8_t wanted_of(const struct topic *topic) {
+    return __atomic_load_n(&topic->demand->wanted, __ATOMIC_RELAXED);
+}
 
 struct target {
     struct routine condition; /* empty: the target gets every message */
@@ -122,7 +140,7 @@ struct thread_env {
     int (*brake)(struct thread_env *env, const struct deadman_destination *to, const struct deadman_datagram *datagram);
     /* Publish the machine's output. If that fails, `why` is set, and valid until the next call. ABANDONED: the thread was
      * stuck in the middleware and has been abandoned: it must not use anything that belongs to others. */
-    enum publication (*publish)(struct thread_env *env, const struct target *target, const char **why);
+    enum publication (*publish)(struct thread_env *env, const struct targets *to, const struct target *target, const char **why);
     struct machine machine; /* last, as it is large */
 };
 

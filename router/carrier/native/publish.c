@@ -10,6 +10,14 @@
 #include "route.h"
 #include "threads.h"
 
+/* A message that waits until it is due. */
+struct held {
+    struct held *next;
+    const struct targets *to;
+    const struct target *target;
+    struct output message;
+};
+
 struct publish_thread {
     struct thread_env env; /* first: its functions get a pointer to it */
     pthread_t thread;
@@ -24,15 +32,88 @@ struct publish_thread {
     _Atomic uint32_t generation; /* nothing of an earlier one is in use */
     struct publishing publishing;
     /* For the thread: */
+    struct held *held, *spare;
     struct ring *ring;
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
 };
 
 /* ---- the middleware ---- */
 
+static void exchange(struct output *one, struct output *other) {
+    struct output kept = *one;
+    *one = *other;
+    *other = kept;
+}
+
+/* Hold a message until it is due, instead of an older one. Return false if memory runs out. */
+static bool hold(struct publish_thread *thread, const struct targets *to, const struct target *target) {
+    struct demand *demand = target->topic->demand;
+    struct held *held = demand->held;
+    if (held) {
+        __atomic_add_fetch(&demand->replaced, 1, __ATOMIC_RELAXED);
+    } else {
+        held = thread->spare ? thread->spare : calloc(1, sizeof *held);
+        if (!held) return false;
+        if (held == thread->spare) thread->spare = held->next;
+        held->next = thread->held;
+        thread->held = demand->held = held;
+    }
+    held->to = to;
+    held->target = target;
+    exchange(&held->message, &thread->env.machine.output);
+    return true;
+}
+
+/* Publish a held message, without the lock. */
+static void release(struct publish_thread *thread, struct held *held) {
+    struct thread_env *env = &thread->env;
+    const struct target *target = held->target;
+    const char *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &held->message);
+    if (thread->is_abandoned) return;
+    if (why) { /* it was counted when it was held */
+        edition_begin(&thread->edition);
+        env_count(env, target->delivered, -1);
+        lose_message(env, held->to, target, env->now(env), (struct lost_event){.reason = DROP_PUBLISH_ERROR}, why);
+        edition_end(&thread->edition);
+    }
+    __atomic_store_n(&target->topic->demand->is_due, 0, __ATOMIC_RELEASE);
+}
+
+/* Publish the held messages that are due, or all. */
+static void release_due(struct publish_thread *thread, bool all) {
+    for (struct held **at = &thread->held; *at && !thread->is_abandoned;) {
+        struct held *held = *at;
+        struct demand *demand = held->target->topic->demand;
+        if (all || __atomic_load_n(&demand->is_due, __ATOMIC_ACQUIRE)) {
+            *at = held->next;
+            demand->held = NULL;
+            release(thread, held);
+            held->next = thread->spare;
+            thread->spare = held;
+        } else {
+            at = &held->next;
+        }
+    }
+}
+
+/* Forget what is held of a topic, because a newer message is published. */
+static void supersede(struct publish_thread *thread, struct demand *demand) {
+    struct held **at = &thread->held, *held = demand->held;
+    while (*at != held) at = &(*at)->next;
+    *at = held->next;
+    held->next = thread->spare;
+    thread->spare = held;
+    demand->held = NULL;
+    __atomic_add_fetch(&demand->replaced, 1, __ATOMIC_RELAXED);
+}
+
 /* Publish the written message, without the lock. The counters balance meanwhile, as the message counts as waiting. */
-static enum publication publish_written(struct thread_env *env, const struct target *target, const char **why) {
+static enum publication publish_written(struct thread_env *env, const struct targets *to, const struct target *target,
+                                        const char **why) {
     struct publish_thread *thread = (struct publish_thread *)env;
+    struct demand *demand = target->topic->demand;
+    if (wanted_of(target->topic) == NEWEST_MESSAGE && hold(thread, to, target)) return PUBLISHED;
+    if (demand->held) supersede(thread, demand);
     edition_end(&thread->edition);
     *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &env->machine.output);
     edition_begin(&thread->edition);
@@ -71,6 +152,7 @@ static void serve_timers(struct publish_thread *thread) {
 /* Go on to a generation, unless it was reached. */
 static void reach(struct publish_thread *thread, uint32_t generation) {
     if (generation <= atomic_load(&thread->generation)) return;
+    release_due(thread, true); /* their targets belong to the generation */
     while (!thread->is_abandoned && thread->changes && thread->changes->generation <= generation) {
         const struct publish_change *change = thread->changes;
         thread->changes = change->next;
@@ -98,11 +180,12 @@ static bool serve_all(struct publish_thread *thread, size_t size) {
     return true;
 }
 
-/* Settle the timers. */
+/* Settle the timers, and publish what they and others hold. */
 static void end_timers(struct publish_thread *thread) {
     edition_begin(&thread->edition);
     timers_end(thread->env.timers);
     edition_end(&thread->edition);
+    release_due(thread, true);
 }
 
 static void *run(void *of) {
@@ -117,6 +200,7 @@ static void *run(void *of) {
         if (thread->is_abandoned || !serve_all(thread, size) || (is_stopping && !size)) break;
         if (!size) reach(thread, latest);
         if (!thread->is_abandoned) serve_timers(thread);
+        if (ring_is_empty(thread->ring)) release_due(thread, false);
         if (thread->is_abandoned) break;
     }
     if (!thread->is_abandoned) end_timers(thread);
@@ -133,6 +217,11 @@ static void publish_close(struct publish_thread *thread) {
     pthread_cond_destroy(&thread->changed);
     pthread_mutex_destroy(&thread->lock);
     if (thread->env.timers) timers_close(thread->env.timers);
+    for (struct held *held; (held = thread->spare);) {
+        thread->spare = held->next;
+        free(held->message.data);
+        free(held);
+    }
     env_close(&thread->env);
     free(thread);
 }

@@ -58,18 +58,30 @@ static void wake_reader(struct ring *ring) {
         syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAKE_PRIVATE, 1, NULL, NULL, 0);
 }
 
-bool ring_put(struct ring *ring, const void *record, uint32_t size) {
+/* Append a record. Return the bytes that are in use then, or 0 if there is no room. */
+static inline uint64_t append_record(struct ring *ring, const void *record, uint32_t size) {
     uint64_t written = atomic_load_explicit(&ring->written, memory_order_relaxed);
     uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
-    if (written - taken + size > ring->capacity) return false;
+    if (written - taken + size > ring->capacity) return 0;
     const uint64_t *words = record;
     /* A reader that sees one of these words also sees that the earlier record was dropped. */
     atomic_thread_fence(memory_order_release);
     for (uint32_t done = 0; done < size; done += WORD)
         atomic_store_explicit(word_at(ring, written + done), *words++, memory_order_relaxed);
     atomic_store_explicit(&ring->written, written + size, memory_order_release);
+    return written - taken + size;
+}
+
+bool ring_put(struct ring *ring, const void *record, uint32_t size) {
+    if (!append_record(ring, record, size)) return false;
     wake_reader(ring);
     return true;
+}
+
+bool ring_put_quietly(struct ring *ring, const void *record, uint32_t size) {
+    uint64_t used = append_record(ring, record, size);
+    if (used > ring->capacity / 2) wake_reader(ring);
+    return used;
 }
 
 bool ring_drop(struct ring *ring, void *record, size_t limit) {
@@ -116,6 +128,11 @@ static size_t take_ready(struct ring *ring, void *records, size_t limit) {
 static void sleep_until_woken(struct ring *ring, int64_t timeout) {
     struct timespec until = {timeout / 1000000000, timeout % 1000000000};
     syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAIT_PRIVATE, 1, timeout < 0 ? NULL : &until, NULL, 0);
+}
+
+bool ring_is_empty(const struct ring *ring) {
+    return atomic_load_explicit(&ring->written, memory_order_acquire)
+           == atomic_load_explicit(&ring->taken, memory_order_relaxed);
 }
 
 size_t ring_take(struct ring *ring, void *records, size_t limit, int64_t timeout) {

@@ -31,11 +31,14 @@ void ring_close(struct ring *ring);
 /* For the writer. `ring_put` returns false if there is no room; `ring_drop` copies up to `limit` bytes of the oldest record
  * to `record`, drops it and returns true, or returns false if the reader was faster. */
 bool ring_put(struct ring *ring, const void *record, uint32_t size);
+/* Likewise, without waking the reader before half of the ring is used. */
+bool ring_put_quietly(struct ring *ring, const void *record, uint32_t size);
 bool ring_drop(struct ring *ring, void *record, size_t limit);
 
 /* For the reader. Copy as many whole records as fit and return their size in bytes. If there are none, wait for up to
  * `timeout` ns (-1: forever), and return 0 after that, after `ring_wake`, or spuriously. A record longer than `limit` is
  * never taken: the buffer must be as long as the longest record. */
+bool ring_is_empty(const struct ring *ring);
 size_t ring_take(struct ring *ring, void *records, size_t limit, int64_t timeout);
 void ring_wake(struct ring *ring);
 

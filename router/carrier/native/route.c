@@ -51,11 +51,17 @@ static void send_to_all(struct routing *routing, const struct targets *to, const
     deliver_to_all(&routing->env, to, &message);
 }
 
-static bool is_wanted(const struct targets *to) {
-    if (to->collect) return true; /* frames are counted even without subscribers */
-    for (uint32_t index = 0; index < to->count; index++)
-        if (__atomic_load_n(to->targets[index].topic->wanted, __ATOMIC_RELAXED)) return true;
-    return false;
+/* What the subscribers of these topics want at most. Neither a `ttl` nor the parts of frames can wait until the newest
+ * message is due. */
+static enum wanted most_wanted(const struct targets *to) {
+    if (to->collect) return EVERY_MESSAGE; /* frames are counted even without subscribers */
+    enum wanted most = NOTHING;
+    for (uint32_t index = 0; index < to->count; index++) {
+        uint8_t wanted = wanted_of(to->targets[index].topic);
+        if (wanted == EVERY_MESSAGE || (wanted && to->ttl)) return EVERY_MESSAGE;
+        if (wanted) most = NEWEST_MESSAGE;
+    }
+    return most;
 }
 
 static void drop_oldest(struct routing *routing, int64_t now) {
@@ -70,7 +76,8 @@ static void drop_oldest(struct routing *routing, int64_t now) {
 
 /* Have the publish thread deliver to topics, if one of them has subscribers. */
 static void hand_over(struct routing *routing, const struct targets *to, const struct received *received) {
-    if (!is_wanted(to)) {
+    enum wanted wanted = most_wanted(to);
+    if (wanted == NOTHING) {
         for (uint32_t index = 0; index < to->count; index++)
             env_count(&routing->env, to->targets[index].filtered, 1);
         return;
@@ -91,7 +98,8 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
     memcpy(record + 1, routing->datagram, received->envelope.size);
     for (uint32_t index = 0; index < to->count; index++)
         env_count(&routing->env, to->targets[index].waiting, 1);
-    while (!ring_put(routing->published, record, record->size)) drop_oldest(routing, received->now);
+    while (!(wanted == EVERY_MESSAGE ? ring_put : ring_put_quietly)(routing->published, record, record->size))
+        drop_oldest(routing, received->now);
 }
 
 /* ---- witnesses ---- */

@@ -84,7 +84,9 @@ static int brake_nowhere(struct thread_env *env, const struct deadman_destinatio
     return 0;
 }
 
-static enum publication publish_nowhere(struct thread_env *env, const struct target *target, const char **why) {
+static enum publication publish_nowhere(struct thread_env *env, const struct targets *to, const struct target *target,
+                                        const char **why) {
+    (void)to;
     (void)why;
     note_output(env, RECORD_PUBLISHED, target->id, env->machine.output.data, env->machine.output.size);
     return PUBLISHED;

@@ -19,8 +19,8 @@ static counter counters[COUNTERS];
 static struct limit limit = {1000, 500, -1000};
 static struct limit *const limits[COLUMNS] = {&limit, &limit, &limit};
 static struct deferral *deferrals[2][COLUMNS];
-static const uint8_t wanted = 1;
-static const struct topic topic = {.wanted = &wanted};
+static struct demand whole = {.wanted = EVERY_MESSAGE};
+static const struct topic topic = {.demand = &whole};
 static const struct target published = {
     .topic = &topic, .waiting = WAITING, .filtered = FILTERED, .dropped = {[DROP_QUEUE_FULL] = QUEUE_FULL}};
 static struct sender nowhere = {.fd = -1};

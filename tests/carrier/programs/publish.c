@@ -55,7 +55,7 @@ static const struct wire_schema schema = {types, 2};
 static const uint8_t header[] = {0, 1, 0, 0};
 static struct limit limit = {1000, 500, -1000};
 static struct limit *const limits[] = {&limit};
-static uint8_t wanted[TOPICS] = {1, 1};
+static struct demand demands[TOPICS];
 static uint32_t latest[TOPICS]; /* numbers that were published; of the thread */
 static _Atomic bool is_stuck, has_ended;
 static _Atomic uint32_t inside;
@@ -91,7 +91,7 @@ static uint32_t topic_counter(int topic, int which) { return (uint32_t)(TOPIC + 
 
 static void make_target(struct made *made, int index) {
     made->publishers[index] = (uint32_t)(ALIVE * TOPICS + index);
-    made->topics[index] = (struct topic){&made->publishers[index], &wanted[index]};
+    made->topics[index] = (struct topic){&made->publishers[index], &demands[index]};
     made->targets[index] = (struct target){
         .topic = &made->topics[index], .message = {made->operations, 3, 0}, .id = (uint32_t)index + 1,
         .condition = {made->operations + 1, (uint32_t)index, 0}, .limits = index ? limits : NULL,
@@ -146,7 +146,8 @@ static struct made *replace_all(const struct round *env, struct made *running) {
         struct change change = {.program = &next->program};
         carrier_change(env->carrier, &change);
         publish_advance(env->publishing, generation);
-        __atomic_store_n(&wanted[0], generation % 5 != 0, __ATOMIC_RELAXED);
+        __atomic_store_n(&demands[0].is_due, generation % 3 == 0, __ATOMIC_RELEASE);
+        __atomic_store_n(&demands[0].wanted, generation % 5 ? 1 + generation % 2 : NOTHING, __ATOMIC_RELAXED);
         usleep(generation % 7 * 300);
         while (!publish_has_reached(env->publishing, generation)) usleep(100);
         free_made(env, running);
@@ -249,6 +250,7 @@ static void play(int round) {
     struct round env;
     bool gets_stuck = round % 4 == 3;
     memset(latest, 0, sizeof latest);
+    for (int topic = 0; topic < TOPICS; topic++) demands[topic] = (struct demand){.wanted = EVERY_MESSAGE};
     open_env(&env);
     struct made *first = make(&env, 1);
     struct change start = {.program = &first->program};
@@ -259,7 +261,7 @@ static void play(int round) {
     pthread_create(&watching, NULL, watch, &env);
     struct made *last = replace_all(&env, first);
     if (gets_stuck) {
-        __atomic_store_n(&wanted[0], 1, __ATOMIC_RELAXED);
+        __atomic_store_n(&demands[0].wanted, EVERY_MESSAGE, __ATOMIC_RELAXED);
         atomic_store(&is_stuck, true);
         while (!atomic_load(&inside)) usleep(100);
     }

@@ -67,7 +67,7 @@ static _Atomic int64_t sent[LISTENERS], taken, commands;
 static _Atomic uint32_t latest, reader_at, commander_at; /* generations */
 static _Atomic(struct deadman *) acting;
 static _Atomic bool is_quiet, has_ended; /* nobody sends; nobody reads either */
-static uint8_t wanted;
+static struct demand demand;
 
 /* ---- sockets ---- */
 
@@ -163,7 +163,7 @@ static struct deadman *open_deadman(void) {
 static struct made *make(uint32_t generation) {
     struct made *made = calloc(1, sizeof *made);
     check(made, "memory");
-    made->topic.wanted = &wanted;
+    made->topic.demand = &demand;
     made->feed.deadman = open_deadman();
     made->layout = (struct layout){.sections = &made->section, .defaults = made->defaults, .slot_count = SLOT_SOURCE + 1};
     made->condition = (struct operation){.kind = OP_INTEGER, .integer = 1};
@@ -215,7 +215,7 @@ static struct made *replace_all(struct made *running, uint32_t count) {
         left[end++ % MOST_LEFT] = running;
         running = next;
         carrier_mirror(carrier, generation % 3 ? mirrored : NULL, MIRROR_LOST);
-        __atomic_store_n(&wanted, generation % 2, __ATOMIC_RELAXED);
+        __atomic_store_n(&demand.wanted, generation % 2, __ATOMIC_RELAXED);
         usleep(generation % 7 * 300);
         for (; first < end; first++) {
             struct made *oldest = left[first % MOST_LEFT];
