@@ -239,7 +239,9 @@ def _in_chunks(values: Any) -> Any:
     if len(values) <= _CHUNK:
         return values
     chunks = (values[start : start + _CHUNK] for start in range(0, len(values), _CHUNK))
-    return orjson.Fragment(b"[" + b",".join([orjson.dumps(chunk, None, _NUMPY)[1:-1] for chunk in chunks]) + b"]")
+    texts = [orjson.dumps(chunk, None, _NUMPY)[1:-1] for chunk in chunks]
+    texts[0], texts[-1] = b"[" + texts[0], texts[-1] + b"]"
+    return orjson.Fragment(b",".join(texts))
 
 
 def _sequence(letter: str) -> Callable[[bytes], Any]:

@@ -175,6 +175,8 @@ class TopicSender:
             self._encode(served, sample, frames, is_new=is_new)
         else:
             served.is_busy = True
+            if served.readable is not None and served.readable is not sample:
+                served.readable.forget()  # its text is large, and soon replaced
             self._tasks.run(self._convert(served, sample, is_new=is_new))
 
     def _is_quick(self, sample: Sample) -> bool:
