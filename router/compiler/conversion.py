@@ -159,27 +159,28 @@ def _to_member(given: tree.Node, member: Field, scope: Scope) -> Plan:
 
 def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
     if isinstance(value, tree.ListLiteral):
-        _require_length(value, target, len(value.items))
+        require_length(value.span, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
     element_kind, length = element_of(value.kind), length_of(value.kind)
     if element_kind is None:
         raise mismatch(value, target, how_to_fill(target, scope))
     if length is not None:
-        _require_length(value, target, length)
+        require_length(value.span, target, length)
     if isinstance(value, tree.Each):
         return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
     element = tree.Variable(element_kind, value.span, scope.element_variable())
     return Each(target, ((element.name, value),), _to_element(element, target.element, scope), value.span)
 
 
-_LIKE_MESSAGES = "fill it from a list of messages, or from messages, [a, b]; fields of the same name are copied"
+_BY_FIELDS = "write its elements, [{FIELD: VALUE}]"
+_LIKE_MESSAGES = f"fill it from a list of messages, of which fields of the same name are copied, or {_BY_FIELDS}"
 
 
 def how_to_fill(target: List, scope: Scope) -> str:
     """Return the hint for a list that something else than a list would fill."""
     if not isinstance(target.element, MessageType):
         return "write a list, [a, b]"
-    return _LIKE_MESSAGES if tree.MESSAGE in scope.given else "leave it out: only a list of messages can fill it"
+    return _LIKE_MESSAGES if tree.MESSAGE in scope.given else _BY_FIELDS
 
 
 def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
@@ -198,16 +199,17 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
         raise ExpressionError(finding.span, finding.code, f"list element: {finding.message}", hint) from error
 
 
-def _require_length(value: tree.Node, target: List, length: int) -> None:
+def require_length(span: SourceSpan, target: List, length: int) -> None:
+    """Raise ExpressionError if a list of this length does not fit the field."""
     if target.length is not None and length != target.length:
         message = f"{target} takes {target.length} elements, not {length}"
         change = "add" if length < target.length else "remove"
         hint = f"{change} {plural(abs(target.length - length), 'element')}"
-        raise ExpressionError(value.span, Code.TYPE_MISMATCH, message, hint)
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     if target.bound is not None and length > target.bound:
         message = f"{target} takes at most {target.bound} elements, not {length}"
         hint = f"remove {plural(length - target.bound, 'element')}"
-        raise ExpressionError(value.span, Code.OUT_OF_RANGE, message, hint)
+        raise ExpressionError(span, Code.OUT_OF_RANGE, message, hint)
 
 
 # scalars

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Union
 
-from router.compiler.conversion import convert, how_to_fill, same_named, unset
+from router.compiler.conversion import convert, how_to_fill, require_length, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.tree import Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
@@ -243,34 +243,71 @@ class _Builder:
         path = prefix + member.name
         source = same_named(automatic, member) if automatic else None
         if isinstance(given, FieldEntry):
-            return self._explicit(member, given, path)
+            return self._explicit(member.type, given.value, path) or unset(member, given.value.span)
         if given is not None:
             return self.record(given, source, f"{path}.")
         if source is not None:
             return self._automatic(member, source, path)
         return unset(member, self.span)
 
-    def _explicit(self, member: Field, entry: FieldEntry, path: str) -> Plan:
+    def _explicit(self, target: Type, value: Expression, path: str) -> Plan | None:
+        """Return the plan of a field or list element, or None after a finding."""
+        if value.items and any(_fields_of(item, target) for item in value.items):
+            return self._elements(target, value, path)
         try:
-            typed = check(entry.value, self.scope, member.type)
-            plan = convert(typed, member.type, self.scope)
+            typed = check(value, self.scope, target)
+            plan = convert(typed, target, self.scope)
         except ExpressionError as error:
             finding = error.diagnostic
-            if entry.value.choices is not None and finding.span == entry.value.span:
-                finding = self._chosen_finding(member, entry.value.choices) or finding
-            if isinstance(member.type, String) and not entry.value.literal and _FRAME.fullmatch(entry.value.text):
-                finding = replace(finding, hint=f"for text, write {{text: {entry.value.text}}}")
+            if value.choices is not None and finding.span == value.span:
+                finding = self._chosen_finding(target, value.choices) or finding
+            if isinstance(target, String) and not value.literal and _FRAME.fullmatch(value.text):
+                finding = replace(finding, hint=f"for text, write {{text: {value.text}}}")
             self.findings.append(finding)
-            return unset(member, entry.value.span)
-        self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))
+            return None
+        self.rows.append(Row(path, str(target), _text(value), str(typed.kind), automatic=False))
         return plan
 
-    def _chosen_finding(self, member: Field, choices: Choices) -> Diagnostic | None:
+    def _elements(self, target: Type, value: Expression, path: str) -> Items | None:
+        """Fill a list of messages with elements of which some are given by their fields."""
+        assert value.items  # noqa: S101 - the caller found one
+        if not isinstance(target, List) or not isinstance(target.element, MessageType):
+            first = next(item.span for item in value.items if item.fields)
+            message = f"cannot assign fields to {target}"
+            self.findings.append(Diagnostic(first, Code.TYPE_MISMATCH, message, self._instead(target)))
+            return None
+        try:
+            require_length(value.span, target, len(value.items))
+        except ExpressionError as error:
+            self.findings.append(error.diagnostic)
+        plans: list[Plan | None] = []
+        for index, item in enumerate(value.items):
+            fields, inner = _fields_of(item, target), f"{path}[{index}]"
+            if fields is None:
+                plans.append(self._explicit(target.element, item, inner))
+            else:
+                plans.append(self._element(target.element, fields, inner))
+        return Items(target, tuple(plan for plan in plans if plan is not None), value.span)
+
+    def _instead(self, target: Type) -> str:
+        """Return the hint for a list of fields that fills something else than a list of messages."""
+        if isinstance(target, List):
+            return how_to_fill(target, self.scope)
+        return "write its fields without the brackets" if isinstance(target, MessageType) else _ONE_VALUE
+
+    def _element(self, target: MessageType, fields: FieldMap, path: str) -> Record:
+        builder = _Builder(self.scope, fields.span, self.origin)
+        plan = builder.record(builder.sort(fields.entries, target), None, f"{path}.")
+        self.rows += builder.rows
+        self.findings += builder.findings
+        return plan
+
+    def _chosen_finding(self, target: Type, choices: Choices) -> Diagnostic | None:
         """Return the finding for the first value of a map that does not fit the field."""
         values = [value for _, value in choices.values]
         for value in values if choices.otherwise is None else [*values, choices.otherwise]:
             try:
-                convert(check(value, self.scope, member.type), member.type, self.scope)
+                convert(check(value, self.scope, target), target, self.scope)
             except ExpressionError as error:
                 return error.diagnostic
         return None
@@ -286,6 +323,15 @@ class _Builder:
             return unset(member, self.span)
         self.rows.append(Row(path, str(member.type), self.origin + path, str(source.kind), automatic=True))
         return plan
+
+
+def _fields_of(item: Expression, target: Type) -> FieldMap | None:
+    """Return the fields of a list element. `{text: value}` is the field `text` of a message that has one."""
+    element = target.element if isinstance(target, List) else None
+    if item.literal and isinstance(element, MessageType) and element.field(TEXT):
+        entry = FieldEntry((TEXT,), (item.span,), replace(item, literal=False))
+        return FieldMap(item.span, auto=False, entries=(entry,))
+    return item.fields
 
 
 def _text(expression: Expression) -> str:

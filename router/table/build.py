@@ -412,11 +412,14 @@ def _choices(node: MappingNode, span: SourceSpan) -> Expression:
 
 
 def _expression(node: Node, span: SourceSpan) -> Expression:
-    """Build an expression: a scalar as written, a list of expressions, a choice, or literal text."""
+    """Build an expression: a scalar as written, a list, a choice, literal text, or the fields of a list's element."""
     if is_choice(node):
         return _choices(mapping(node), span)
+    if is_text(node):
+        return replace(_expression(mapping(node).entries[TEXT].value, span), literal=True)
     if isinstance(node, MappingNode):
-        return replace(_expression(node.entries[TEXT].value, span), literal=True)
+        fields = FieldMap(node.span, auto=False, entries=tuple(_field_entries(node, (), ())))
+        return Expression("", TextSpan(node.span), fields=fields)
     if isinstance(node, SequenceNode):
         return Expression("", TextSpan(node.span), tuple(_expression(item, item.span) for item in node.items))
     written = scalar(node)

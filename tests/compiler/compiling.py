@@ -58,6 +58,11 @@ def field_map(auto: bool = False, /, **entries: str | Expression) -> FieldMap:
     return FieldMap(SPAN, auto, tuple(FieldEntry(path, (SPAN,) * len(path), value) for path, value in values.items()))
 
 
+def listed(*elements: FieldMap) -> Expression:
+    """The expression `[{x: 1}, {y: 2}]`, a list of messages."""
+    return Expression("", TextSpan(SPAN), tuple(Expression("", TextSpan(SPAN), fields=fields) for fields in elements))
+
+
 AUTO = field_map(True)
 
 

@@ -16,9 +16,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from router.table.model.expressions import Expression
+from router.table.model.expressions import Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.compiling import chosen, written
+from tests.compiler.compiling import chosen, field_map, listed, written
 from tests.compiler.payloads import Wire, wire_of
 
 
@@ -238,7 +238,14 @@ class Language:
         """An expression that fills a field, or that is refused for its range or length."""
         if noise.randrange(12) == 0 and not isinstance(_innermost(target), MessageType):
             return self._choices(noise, target)
+        if isinstance(target, List) and isinstance(target.element, MessageType) and noise.randrange(4) == 0:
+            return listed(*(self._fields(noise, target.element) for _ in range(noise.choice((1, 2)))))
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
+
+    def _fields(self, noise: random.Random, target: MessageType) -> FieldMap:
+        """Fields of a list element; a oneof gets one member."""
+        members = {member.oneof or member.name: member for member in target.fields}.values()
+        return field_map(**{member.name: self.filled(noise, member.type) for member in members})
 
     def _value(self, noise: random.Random, target: Type, depth: int) -> str:
         if not self.is_ros and str(target) in _OF_PROTOBUF and noise.randrange(2):

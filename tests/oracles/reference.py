@@ -103,6 +103,11 @@ def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, con
 
 
 def _of_expression(given: Expression, target: Type, context: Context) -> Value:
+    if given.fields is not None:
+        assert isinstance(target, MessageType)
+        return fill_given(given.fields, target, context)
+    if given.items and isinstance(target, List) and any(item.fields is not None for item in given.items):
+        return all_of([partial(_of_expression, item, target.element, context) for item in given.items])
     meaning = meaning_of(given, context, target)
     if isinstance(target, (List, Bytes)):
         return _to_list(elements_of(meaning, context), target)

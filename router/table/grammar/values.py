@@ -24,6 +24,11 @@ _NAME = "[A-Za-z_][A-Za-z0-9_]*"
 _KEY_PART = r"(?!@)[^/*$#?\s]+"
 _SCALAR = ["string", "number", "boolean"]
 _FIELDS: Schema = {"propertyNames": ref("field_path"), "additionalProperties": ref("field_value")}
+_CHOICE_OR_FIELDS: Schema = {
+    "if": {"required": ["map"], "properties": {"map": {"type": _SCALAR}}},
+    "then": ref("choice"),
+    "else": ref("nested_fields"),
+}
 _MUST_BE_CHOSEN = "must be an expression, or text as {text: WORD}"
 
 
@@ -129,11 +134,14 @@ VALUES: Schema = {
         "pattern": rf"^{_NAME}(?:\.{_NAME})*$",
         "errorMessage": "must be a field's name, or several with '.' between them",
     },
-    "field_value": one_of("object", {
-        "if": {"required": ["map"], "properties": {"map": {"type": _SCALAR}}},
-        "then": ref("choice"),
-        "else": ref("nested_fields"),
-    }, ref("expression")),
+    "field_value": one_of("object", _CHOICE_OR_FIELDS, one_of("array", ref("list"), ref("expression"))),
+    "list": key(
+        "List", "The elements of a list: an expression each, or the fields of a message.",
+        {"type": "array", "items": one_of("object", _CHOICE_OR_FIELDS, {
+            "type": _SCALAR, "errorMessage": "must be an expression, or the fields of a message",
+        })},
+        ["gyro_x", "gyro_y"], [{"id": 3, "forward": "linear.x"}, {"id": 4}],
+    ),
     "nested_fields": key(
         "Fields", "The fields of a nested message, each with its expression.",
         {"type": "object", "minProperties": 1, **_FIELDS},

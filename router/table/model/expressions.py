@@ -11,7 +11,8 @@ class Expression:
     """The text of an expression, not yet parsed.
 
     `text_span` has the position of each character. A YAML sequence becomes `items`, a mapping with the key `map`
-    becomes `choices`; both have empty text. `literal` text, `{text: imu_link}`, is not an expression.
+    becomes `choices`, and another mapping, an element of a list of messages, becomes `fields`; these have empty text.
+    `literal` text, `{text: imu_link}`, is not an expression.
     """
 
     text: str
@@ -19,6 +20,7 @@ class Expression:
     items: "tuple[Expression, ...] | None" = None
     choices: "Choices | None" = None
     literal: bool = False
+    fields: "FieldMap | None" = None
 
     @property
     def span(self) -> SourceSpan:
@@ -27,6 +29,8 @@ class Expression:
     def __str__(self) -> str:
         if self.choices is not None:
             return str(self.choices)
+        if self.fields is not None:
+            return str(self.fields)
         if self.literal:
             return repr(self.text)
         return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
