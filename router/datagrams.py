@@ -50,8 +50,8 @@ class Wire:
             raise UsageError(f"{self.envelope.name} has no payload case '{name}'", hint)
         return self.envelope.cases[name]
 
-    def encode(self, case: PayloadCase, payload: Message) -> bytes:
-        """Return the exact encoding of an envelope with this payload. All other fields of the envelope are empty.
+    def encode(self, case: PayloadCase, payload: Message, beside: Message | None = None) -> bytes:
+        """Return the exact encoding of an envelope with this payload, and with the other fields of `beside`.
 
         Raises UsageError if the payload lacks a required field.
         """
@@ -59,6 +59,8 @@ class Wire:
             fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
             raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
         outer = self.envelope.message_class()
+        if beside is not None:
+            outer.CopyFrom(beside)
         inner = getattr(outer, case.name)
         inner.SetInParent()
         inner.CopyFrom(payload)

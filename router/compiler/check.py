@@ -121,7 +121,7 @@ def check_table(
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
     if not _has_errors(findings):
-        lowered, limits = lower_table(routes)
+        lowered, limits = lower_table(routes, envelope)
         findings += limits
         lowered = None if limits else lowered
     schema.sources.close()
@@ -161,7 +161,7 @@ def _envelope_findings(
     if table.envelope is None or not names:
         return
     span = table.envelope.message.span
-    beside = [member for member in schema.messages[envelope.name].fields if member.oneof != envelope.oneof]
+    beside = envelope.beside.fields
     for name in (member.name for member in beside if member.is_required):
         message = f"nothing fills '{name}', which {envelope.name} requires, in envelopes for '{names[0]}'"
         yield Diagnostic(span, Code.MISSING_KEY, message, f"see {schema.span(envelope.name, name)}; make it optional")

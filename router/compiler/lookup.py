@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -175,16 +175,22 @@ class Lookup:
         message: MessageType,
         ros_type: MessageType | None = None,
         names: Mapping[str, Node] = NO_NAMES,
+    ) -> Scope:
+        """Return the scope of expressions over `message`, with the constants of `ros_type` and of the types in it."""
+        nested = tuple(nested_types(ros_type)) if ros_type else ()
+        return Scope(message, tuple(self.schema.enums.values()), nested, names)
+
+    def received(
+        self,
+        case: PayloadCase,
+        ros_type: MessageType | None = None,
+        names: Mapping[str, Node] = NO_NAMES,
         route: Route | None = None,
     ) -> Scope:
-        """Return the scope of expressions over `message`, with the constants of `ros_type` and of the types in it.
-
-        `route` is a route that takes `message` from endpoints, or None.
-        """
-        nested = tuple(nested_types(ros_type)) if ros_type else ()
+        """Return the scope of expressions over a payload from UDP and its envelope. A `route` names its sources."""
         sources = tuple(source.value for source in route.sources) if route else ()
         known = () if ANY in sources else sources
-        return Scope(message, tuple(self.schema.enums.values()), nested, names, sources=known)
+        return replace(self.scope(case.type, ros_type, names), envelope=self.envelope, sources=known)
 
     def value(
         self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""

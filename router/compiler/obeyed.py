@@ -28,7 +28,7 @@ def check_obeyed(lookup: Lookup, route: Route) -> ObeyedPlan | None:
         return None
     watched = _watched(lookup, deadman, obeyed.case)
     hint = "write a comparison, such as abs(front_left_motor.rpm) < 5"
-    when = lookup.value(obeyed.when, lookup.scope(case.type), (BoolKind,), "'obeyed' takes a bool", hint)
+    when = lookup.value(obeyed.when, lookup.received(case), (BoolKind,), "'obeyed' takes a bool", hint)
     if when is None:
         return None
     if not any(isinstance(node, (Read, Present)) for node in _nodes(when)):

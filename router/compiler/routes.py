@@ -11,7 +11,7 @@ from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.scope import field_of
-from router.compiler.expressions.tree import COUNT, INDEX, ITEM, ITEMS, Node, Variable
+from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Variable
 from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -61,6 +61,7 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
     return checked
 
 
+_WITHOUT_ENVELOPE = {ENVELOPE: ("a message from ROS has no envelope", "name a field of the message")}
 _NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' need `for_each`, which this route lacks"
 _NO_COLLECT = f"'{ITEMS}' and '{COUNT}' need `collect`, which this route lacks"
 _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD, timeout: 1s}`"
@@ -172,13 +173,13 @@ def _forward(
     if destination.fields is not None:
         message, hint = "datagrams are forwarded unchanged", "use 'fields' only for messages from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
-    return _destination(lookup, route, destination, endpoint, lookup.scope(case.type, route=route))
+    return _destination(lookup, route, destination, endpoint, lookup.received(case, route=route))
 
 
 def _publish(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Node]
 ) -> Target:
-    scope = lookup.scope(case.type, ros_type, names, route)
+    scope = lookup.received(case, ros_type, names, route)
     if not names:
         scope.absent = dict.fromkeys((ITEMS, COUNT), (_NO_COLLECT, _COLLECT))
     when = lookup.when(topic.when, scope)
@@ -199,7 +200,7 @@ def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) 
     if not route.topics and route.destinations:
         message = "'collect' assembles frames for topics, but this route has none"
         lookup.report(collect.span, Code.UNKNOWN_KEY, message, "remove it: destinations receive each datagram")
-    scope = lookup.scope(case.type)
+    scope = lookup.received(case)
     names = (IntKind, EnumKind, StringKind, BoolKind)
     by = lookup.value(collect.by, scope, names, "'by' takes an integer or a string that identifies the frame")
     count = lookup.value(collect.count, scope, (IntKind,), "'count' takes an integer")
@@ -242,8 +243,9 @@ def _subscription(
         if for_each is None:
             return None
         scope = lookup.scope(ros_type, ros_type, _element_names(for_each))
+        scope.absent = _WITHOUT_ENVELOPE
     else:
-        scope.absent = _without_for_each(ros_type)
+        scope.absent = {**_without_for_each(ros_type), **_WITHOUT_ENVELOPE}
     when = lookup.when(topic.when, scope)
     own = any(destination.fields for destination, _ in recipients)  # then the route needs no fields of its own
     targets = []

@@ -106,7 +106,10 @@ def _datagram(given: Given, wire: Wire, now: int) -> bytes:
     data = given.data or b""
     try:
         if given.case is not None and given.fields is not None:
-            data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
+            payload = protobuf_message(given.case.message_class, given.fields, now)
+            around = wire.envelope.message_class
+            beside = protobuf_message(around, given.beside, now) if given.beside is not None else None
+            data = wire.encode(given.case, payload, beside)
         return framed(data, given.trim, given.pad)
     except UsageError as error:
         raise InvalidValueError(given.span, Code.BAD_VALUE, str(error)) from error

@@ -34,7 +34,8 @@ class Given:
     """A message that arrives `times` times, `every` ns, each sent `age` ns before.
 
     With a `topic` it is a ROS message, else a datagram from `peer` at `listener`. Its content is `fields` (for a
-    datagram, those of the payload `case`) or the bytes `data`. `pad` in bytes, 0 for none.
+    datagram, those of the payload `case`, and `beside` of the envelope) or the bytes `data`. `pad` in bytes, 0 for
+    none.
     """
 
     span: SourceSpan
@@ -43,6 +44,7 @@ class Given:
     listener: str = ""
     case: PayloadCase | None = None
     fields: Fields | None = None
+    beside: Fields | None = None
     data: bytes | None = None
     trim: bool = False
     pad: int = 0
@@ -139,6 +141,11 @@ class Names:
             raise InvalidValueError(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
         return envelope.cases[name]
 
+    @property
+    def beside(self) -> MessageType:
+        """The fields of the envelope beside the payload."""
+        return self._program.envelope.beside
+
     def peer(self, name: str, span: SourceSpan) -> Peer:
         """Return the address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
@@ -214,7 +221,7 @@ class Names:
 # given
 
 
-_KEYS_OF_DATAGRAMS = ("case", "fields", "from", "listener", "trim", "pad")
+_KEYS_OF_DATAGRAMS = ("case", "fields", "envelope", "from", "listener", "trim", "pad")
 _KEYS_OF_MESSAGES = ("topic", "message")
 
 
@@ -239,8 +246,9 @@ class GivenReader:
         if (named is None) == (data is None):
             message = "write a datagram as 'case' with 'fields' or as 'hex', a ROS message with 'topic'"
             raise InvalidValueError(span, Code.BAD_VALUE, message)
-        if named is None and (fields := node.entries.get("fields")):
-            raise InvalidValueError(fields.key.span, Code.UNKNOWN_KEY, "'fields' needs 'case'")
+        for key in ("fields", "envelope") if named is None else ():
+            if entry := node.entries.get(key):
+                raise InvalidValueError(entry.key.span, Code.UNKNOWN_KEY, f"'{key}' needs 'case'")
         case = self._names.case(named.value, named.span) if named else None
         pad = integer(node, "pad")
         times, every, age = _repetition(node)
@@ -250,6 +258,7 @@ class GivenReader:
             listener=self._names.listener(optional_text(node, "listener"), sender.value, span),
             case=case,
             fields=self._content(case.type, node.get("fields"), span) if case else None,
+            beside=self._content(self._names.beside, node.get("envelope"), span) if case else None,
             data=data,
             trim=boolean(node, "trim"),
             pad=pad.value if pad else 0,

@@ -151,7 +151,7 @@ class Unroutable:
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The message around every payload, by full name.
+    """The message around every payload, by full name. `beside` has only its fields beside the payload.
 
     `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. The members
     of its oneof are the `cases`, and those that no route can take.
@@ -163,6 +163,7 @@ class Envelope:
     cases: Mapping[str, PayloadCase]
     max_size: int
     unroutable: Mapping[str, Unroutable] = field(default_factory=dict)
+    beside: MessageType = field(default_factory=lambda: MessageType(""))
 
     @property
     def numbers(self) -> Mapping[str, int]:
@@ -368,7 +369,10 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     unroutable = {
         field.name: Unroutable(field.number, declared_type(field), encoding_of(field).wire_type) for field in others
     }
-    return Envelope(name, oneof.name, schema.message_class(name), cases, max_size, unroutable)
+    beside = tuple(member for member in schema.messages[name].fields if member.oneof != oneof.name)
+    return Envelope(
+        name, oneof.name, schema.message_class(name), cases, max_size, unroutable, MessageType(name, beside)
+    )
 
 
 def _oneof_hint(schema: ProtoSchema, name: str) -> str:

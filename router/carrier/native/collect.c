@@ -406,13 +406,14 @@ static struct frame *take(struct timers *timers, struct collector *collector, co
     return complete;
 }
 
-/* Read the first payload of a frame, and store the list of all payloads in the slot for `items`. */
+/* Read the first payload of a frame and the last envelope, and store the list of all payloads in the slot for `items`. */
 static bool read_frame(struct machine *machine, const struct targets *to, const struct frame *frame,
                        const struct datagram *last) {
     const struct collect *of = to->collect;
     struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
     begin_datagram(machine, to->layout, to->sources, last);
-    if (!machine_read(machine, first.bytes, first.size)) return false;
+    if (!machine_read(machine, first.bytes, first.size) || !machine_read_envelope(machine, last->data, last->size))
+        return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
         if (!list_add(machine, &items, payload_of(of->collector, frame, index)))
             return machine_refuse(machine, (struct refusal){.kind = REFUSED_ROOM});

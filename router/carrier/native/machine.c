@@ -47,6 +47,11 @@ bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t si
     return check_read(machine, read_protobuf_pieces(machine, 0, data, size));
 }
 
+bool machine_read_envelope(struct machine *machine, const uint8_t *data, size_t size) {
+    uint16_t envelope = machine->layout->envelope;
+    return !envelope || check_read(machine, read_protobuf(machine, envelope, data, size));
+}
+
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element) {
     const struct layout *layout = machine->layout;
     const struct section *of = &layout->sections[section];

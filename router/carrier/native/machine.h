@@ -69,6 +69,9 @@ bool machine_read(struct machine *machine, const uint8_t *data, size_t size);
 /* The same for a protobuf message in pieces (read_protobuf.h). */
 bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t size);
 
+/* Read the fields of an envelope beside the payload into the slots, if the layout has any. Fails like `machine_read`. */
+bool machine_read_envelope(struct machine *machine, const uint8_t *data, size_t size);
+
 /* Give the slots of a section their defaults, and read an element of a list of messages into them. */
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element);
 

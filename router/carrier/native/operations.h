@@ -282,7 +282,8 @@ struct layout {
     const struct closed_enum *closed;
     const uint8_t *literals;
     uint32_t slot_count;
-    uint32_t is_cdr;
+    uint16_t is_cdr;
+    uint16_t envelope; /* section of the envelope of a datagram, 0 if no routine reads fields beside the payload */
 };
 
 #endif

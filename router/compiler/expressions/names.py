@@ -23,6 +23,7 @@ from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import ExpressionError, Scope, field_of, require_readable
 from router.compiler.expressions.syntax import Parsed, dotted
 from router.compiler.expressions.tree import (
+    ENVELOPE,
     MESSAGE,
     SOURCE,
     Constant,
@@ -46,6 +47,8 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> N
         return _readable(field_of(scope.whole_message(span), member, span))
     if text in scope.given:
         return _given(text, span, scope)
+    if text == ENVELOPE and (envelope := scope.whole_envelope(span)):
+        return envelope
     if text in ("true", "false"):  # as YAML spells them
         return constant(text == "true", span)
     values = dict(expected.values) if isinstance(expected, Enum) else {}
@@ -160,16 +163,18 @@ def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
     path = dotted(node)
     if path is None or path[0] in (*scope.given, *scope.field_names()):
         return None
-    return path
+    return None if path[0] == ENVELOPE and scope.envelope is not None else path
 
 
 def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
-    """Return the source message if `holder` is the name `message` and no submessage has that name; otherwise None."""
-    member = scope.message.field(MESSAGE)
-    is_meant = (
-        isinstance(holder, ast.Name) and holder.id == MESSAGE and not isinstance(member and member.type, MessageType)
-    )
-    return scope.whole_message(text.span(holder)) if is_meant else None
+    """Return the source message or its envelope if `holder` names it and no submessage; otherwise None."""
+    if not isinstance(holder, ast.Name) or holder.id not in (MESSAGE, ENVELOPE):
+        return None
+    member = scope.message.field(holder.id)
+    if isinstance(member and member.type, MessageType):
+        return None
+    span = text.span(holder)
+    return scope.whole_message(span) if holder.id == MESSAGE else scope.whole_envelope(span)
 
 
 def is_null(node: ast.expr, scope: Scope) -> bool:
@@ -208,6 +213,11 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> 
     member = holder.kind.type.field(node.attr)
     if member is None:
         message = f"{holder.kind.type} has no field '{node.attr}'"
+        envelope = scope.envelope
+        if envelope is not None and holder.kind.type is envelope.beside and node.attr in envelope.numbers:
+            message = f"'{node.attr}' is a payload, not a field beside it"
+            hint = f"name fields of the payload without '{ENVELOPE}.{node.attr}.'; another payload has its own route"
+            raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
         if further := _further(holder.kind.type, node, text):
             raise ExpressionError(text.span(text.outermost(node)), Code.UNKNOWN_FIELD, message, one_of(further))
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])

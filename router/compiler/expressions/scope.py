@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 
 from router.compiler.expressions.kinds import MessageKind, kind_of
-from router.compiler.expressions.tree import MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
+from router.compiler.expressions.tree import ENVELOPE, MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
 from router.errors import Code, FindingError, SourceSpan
 from router.types.model import Enum, Field, List, MessageType, String
+from router.types.protobuf import Envelope
 
 
 class ExpressionError(FindingError):
@@ -22,8 +23,9 @@ class Scope:
 
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
     additional variables, which take precedence over fields. `given` are those of MESSAGE, SOURCE and RECEIVED_AT that
-    are available. `sources` are the possible values of SOURCE, empty if they are not known. `absent` are names that a
-    missing key of the route would define, each with message and hint.
+    are available. `envelope` is that of a message from UDP, which ENVELOPE then names. `sources` are the possible
+    values of SOURCE, empty if they are not known. `absent` are names that a missing key of the route would define, each
+    with message and hint.
     """
 
     message: MessageType
@@ -31,6 +33,7 @@ class Scope:
     ros_types: Collection[MessageType]
     names: Mapping[str, Node] = field(default_factory=dict)
     given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
+    envelope: Envelope | None = None
     sources: Collection[str] = ()
     absent: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     _elements: Iterator[int] = field(default_factory=lambda: count(1))
@@ -62,10 +65,16 @@ class Scope:
     def messages(self) -> list[tuple[str, MessageType]]:
         """Return the messages whose fields can be read, each with the prefix of a field's name."""
         kinds = [(f"{name}.", node.kind) for name, node in self.names.items()]
-        return [("", self.message), *((prefix, kind.type) for prefix, kind in kinds if isinstance(kind, MessageKind))]
+        beside = [(f"{ENVELOPE}.", self.envelope.beside)] if self.envelope is not None else []
+        variables = [(prefix, kind.type) for prefix, kind in kinds if isinstance(kind, MessageKind)]
+        return [("", self.message), *variables, *beside]
 
     def whole_message(self, span: SourceSpan) -> Variable:
         return Variable(MessageKind(self.message), span, MESSAGE)
+
+    def whole_envelope(self, span: SourceSpan) -> Variable | None:
+        """Return the fields beside the payload; None for a message that is not from UDP."""
+        return Variable(MessageKind(self.envelope.beside), span, ENVELOPE) if self.envelope is not None else None
 
 
 def field_of(holder: Node, member: Field, span: SourceSpan) -> Read:

@@ -18,6 +18,9 @@ from router.types.model import Field
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 """Variables in every expression; a field of the same name takes precedence."""
 
+ENVELOPE = "envelope"
+"""Likewise for a message from UDP: the message around the payload, without the payload."""
+
 ITEM, INDEX, COUNT, ITEMS = "item", "index", "count", "items"
 """Variables of `for_each` (the first three) and of `collect` (the last two)."""
 
@@ -56,7 +59,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """The source message (MESSAGE), another variable, or an element of an Each (`item_1`, ...)."""
+    """The source message (MESSAGE), its ENVELOPE, another variable, or an element of an Each (`item_1`, ...)."""
 
     kind: Kind
     span: SourceSpan

@@ -20,7 +20,7 @@ from router.compiler.lowering.lowered import (
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
 from router.errors import Diagnostic
-from router.types.protobuf import PayloadCase
+from router.types.protobuf import Envelope, PayloadCase
 
 __all__ = [
     "Lowered",
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 
-def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnostic]]:
+def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope | None = None) -> tuple[Lowered, list[Diagnostic]]:
     """Lower all targets of a table without errors. Return findings for those that are too large."""
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
@@ -47,7 +47,7 @@ def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnosti
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             try:
                 if targets:
-                    lowered[checked.route.name] = Datagram(checked.case).lowered(checked, targets)
+                    lowered[checked.route.name] = Datagram(checked.case, envelope).lowered(checked, targets)
             except TooLargeError as error:
                 findings.append(error.diagnostic)
         for feed in checked.subscriptions:
@@ -58,14 +58,17 @@ def lower_table(routes: Sequence[CheckedRoute]) -> tuple[Lowered, list[Diagnosti
                 findings.append(error.diagnostic)
         try:
             if checked.obeyed is not None:
-                obeyed[checked.route.name] = lower_condition(checked.obeyed.when, checked.obeyed.case, is_bounded=True)
+                when, case = checked.obeyed.when, checked.obeyed.case
+                obeyed[checked.route.name] = lower_condition(when, case, envelope, is_bounded=True)
         except TooLargeError as error:
             findings.append(error.diagnostic)
     return Lowered(to_destinations, to_topics, from_ros, obeyed), findings
 
 
-def lower_condition(condition: Node, case: PayloadCase, *, is_bounded: bool = False) -> LoweredCondition:
+def lower_condition(
+    condition: Node, case: PayloadCase, envelope: Envelope | None = None, *, is_bounded: bool = False
+) -> LoweredCondition:
     """Lower a single condition on a payload. Raises TooLargeError. `is_bounded`: the receive thread evaluates it."""
-    source = Datagram(case)
+    source = Datagram(case, envelope)
     routine, _ = source.condition(source.lowering(), [condition], is_bounded=is_bounded)
     return LoweredCondition(routine, source.layout(condition.span))

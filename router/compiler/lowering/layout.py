@@ -57,7 +57,8 @@ class PlacedSection(NamedTuple):
 class Layout:
     """`struct layout`. The first section is the source message.
 
-    `closed` are the numbers of closed enums, ascending. `names` describe the slots and `messages` the sections, for
+    `envelope` is the section of the envelope, 0 if no routine reads fields beside the payload. `closed` are the numbers
+    of closed enums, ascending. `names` describe the slots and `messages` the sections, for
     `explain`.
     """
 
@@ -67,6 +68,7 @@ class Layout:
     names: tuple[str, ...]
     messages: tuple[str, ...]
     closed: tuple[tuple[int, ...], ...] = ()
+    envelope: int = 0
 
 
 class Numbering:
@@ -92,22 +94,25 @@ class Numbering:
         self.sections = [PlacedSection((), 0, 0)] * len(sections)
         self.messages = [section.type.name for section in sections]
 
-    def made(self, *, is_cdr: bool, closed: Iterable[tuple[int, ...]] = ()) -> Layout:
+    def made(self, *, is_cdr: bool, closed: Iterable[tuple[int, ...]] = (), envelope: int = 0) -> Layout:
         sections, defaults, names, messages = self.sections, self.defaults, self.names, self.messages
-        return Layout(is_cdr, tuple(sections), tuple(defaults), tuple(names), tuple(messages), tuple(closed))
+        return Layout(is_cdr, tuple(sections), tuple(defaults), tuple(names), tuple(messages), tuple(closed), envelope)
 
 
 # ---- datagrams
 
 
-def protobuf_layout(slots: Sequence[Slot], payload: Section, elements: Sequence[Section]) -> Layout:
-    """Number `slots` from 0, then those of the payload, then those of list elements. Return the layout."""
+def protobuf_layout(
+    slots: Sequence[Slot], payload: Section, envelope: Section | None, elements: Sequence[Section]
+) -> Layout:
+    """Number `slots` from 0, then those of the payload, the envelope and list elements. Return the layout."""
     maker = _ProtobufNumbering(slots)
-    roots = payload, *elements
+    beside = (envelope,) if envelope is not None and envelope.wanted else ()
+    roots = payload, *beside, *elements
     maker.number_sections([*chain.from_iterable(map(_all, roots))])
     for root in roots:
         maker.place(root)
-    return maker.made(is_cdr=False, closed=maker.closed.values())
+    return maker.made(is_cdr=False, closed=maker.closed.values(), envelope=beside[0].index if beside else 0)
 
 
 def _all(section: Section) -> Iterator[Section]:

@@ -49,6 +49,7 @@ class Routines:
             literals=self.arrays.text(bytes(self._literals)),
             slot_count=len(layout.defaults),
             is_cdr=layout.is_cdr,
+            envelope=layout.envelope,
         )
         return ctypes.pointer(self.arrays.add(native))
 

@@ -33,7 +33,7 @@ from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_OPEN, MOST_SECTIONS_D
 from router.errors import SourceSpan
 from router.table.model.routes import Route
 from router.types.model import MessageType
-from router.types.protobuf import PayloadCase
+from router.types.protobuf import Envelope, PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
 """Maximum operations of a destination's `when` per datagram, about a millisecond of the receive thread."""
@@ -86,11 +86,16 @@ class _Source:
 
 
 class Datagram(_Source):
-    """A payload from UDP."""
+    """A payload from UDP, in its envelope unless it is read alone."""
 
-    def __init__(self, case: PayloadCase) -> None:
+    def __init__(self, case: PayloadCase, envelope: Envelope | None = None) -> None:
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
         super().__init__(Section(case.type, descriptor))
+        self._envelope: Section | None = None
+        if envelope is not None:
+            around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
+            self._envelope = Section(envelope.beside, around, f"{tree.ENVELOPE}.")
+            self.variables[tree.ENVELOPE] = self._envelope
 
     def lowered(self, checked: CheckedRoute, targets: Sequence[Target]) -> LoweredRoute:
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
@@ -126,11 +131,12 @@ class Datagram(_Source):
 
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all routines made so far. Raises TooLargeError."""
-        for section in (self.root, *self.elements):
+        around = (self._envelope,) if self._envelope is not None else ()
+        for section in (self.root, *around, *self.elements):
             if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
                 message = f"this reads a field {depth} messages deep; the limit is {MOST_SECTIONS_DEEP - 1}"
                 raise TooLargeError(span, message, "read less deeply nested fields")
-        return _small(protobuf_layout(self.temporaries, self.root, self.elements), span)
+        return _small(protobuf_layout(self.temporaries, self.root, self._envelope, self.elements), span)
 
 
 class RosMessage(_Source):
