@@ -66,9 +66,16 @@ def _nested(entry: FieldEntry, target: MessageType) -> FieldEntry:
     for name in entry.path:
         member = holder.field(name) if isinstance(holder, MessageType) else None
         holder = member.type if member else None
-    if not entry.value.literal or not isinstance(holder, MessageType) or holder.field(TEXT) is None:
-        return entry
-    return FieldEntry((*entry.path, TEXT), (*entry.path_spans, entry.value.span), replace(entry.value, literal=False))
+    return _text_field(entry.value, holder, entry.path, entry.path_spans) or entry
+
+
+def _text_field(
+    value: Expression, holder: Type | None, path: tuple[str, ...] = (), spans: tuple[SourceSpan, ...] = ()
+) -> FieldEntry | None:
+    """Return `{text: value}` for the message `holder` at `path` as the entry of its field `text`, if it has one."""
+    if not value.literal or not isinstance(holder, MessageType) or holder.field(TEXT) is None:
+        return None
+    return FieldEntry((*path, TEXT), (*spans, value.span), replace(value, literal=False))
 
 
 @dataclass(slots=True)
@@ -252,8 +259,9 @@ class _Builder:
 
     def _explicit(self, target: Type, value: Expression, path: str) -> Plan | None:
         """Return the plan of a field or list element, or None after a finding."""
-        if value.items and any(_fields_of(item, target) for item in value.items):
-            return self._elements(target, value, path)
+        fields = [_fields_of(item, target) for item in value.items or ()]
+        if any(fields):
+            return self._elements(target, value, fields, path)
         try:
             typed = check(value, self.scope, target)
             plan = convert(typed, target, self.scope)
@@ -268,25 +276,24 @@ class _Builder:
         self.rows.append(Row(path, str(target), _text(value), str(typed.kind), automatic=False))
         return plan
 
-    def _elements(self, target: Type, value: Expression, path: str) -> Items | None:
-        """Fill a list of messages with elements of which some are given by their fields."""
-        assert value.items  # noqa: S101 - the caller found one
+    def _elements(self, target: Type, value: Expression, fields: Sequence[FieldMap | None], path: str) -> Items | None:
+        """Fill a list of messages with the items of `value`, some of which are given by their `fields`."""
         if not isinstance(target, List) or not isinstance(target.element, MessageType):
-            first = next(item.span for item in value.items if item.fields)
+            first = next(given.span for given in fields if given)
             message = f"cannot assign fields to {target}"
             self.findings.append(Diagnostic(first, Code.TYPE_MISMATCH, message, self._instead(target)))
             return None
         try:
-            require_length(value.span, target, len(value.items))
+            require_length(value.span, target, len(fields))
         except ExpressionError as error:
             self.findings.append(error.diagnostic)
         plans: list[Plan | None] = []
-        for index, item in enumerate(value.items):
-            fields, inner = _fields_of(item, target), f"{path}[{index}]"
-            if fields is None:
+        for index, (item, given) in enumerate(zip(value.items or (), fields, strict=True)):
+            inner = f"{path}[{index}]"
+            if given is None:
                 plans.append(self._explicit(target.element, item, inner))
             else:
-                plans.append(self._element(target.element, fields, inner))
+                plans.append(self._element(target.element, given, inner))
         return Items(target, tuple(plan for plan in plans if plan is not None), value.span)
 
     def _instead(self, target: Type) -> str:
@@ -327,11 +334,8 @@ class _Builder:
 
 def _fields_of(item: Expression, target: Type) -> FieldMap | None:
     """Return the fields of a list element. `{text: value}` is the field `text` of a message that has one."""
-    element = target.element if isinstance(target, List) else None
-    if item.literal and isinstance(element, MessageType) and element.field(TEXT):
-        entry = FieldEntry((TEXT,), (item.span,), replace(item, literal=False))
-        return FieldMap(item.span, auto=False, entries=(entry,))
-    return item.fields
+    text = _text_field(item, target.element if isinstance(target, List) else None)
+    return FieldMap(item.span, auto=False, entries=(text,)) if text else item.fields
 
 
 def _text(expression: Expression) -> str:

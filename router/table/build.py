@@ -418,8 +418,7 @@ def _expression(node: Node, span: SourceSpan) -> Expression:
     if is_text(node):
         return replace(_expression(mapping(node).entries[TEXT].value, span), literal=True)
     if isinstance(node, MappingNode):
-        fields = FieldMap(node.span, auto=False, entries=tuple(_field_entries(node, (), ())))
-        return Expression("", TextSpan(node.span), fields=fields)
+        return Expression("", TextSpan(node.span), fields=_listed_fields(node, node.span))
     if isinstance(node, SequenceNode):
         return Expression("", TextSpan(node.span), tuple(_expression(item, item.span) for item in node.items))
     written = scalar(node)
@@ -436,8 +435,12 @@ def _fields(node: Node, span: SourceSpan) -> FieldMap:
 
 
 def _constants(entry: Entry) -> FieldMap:
-    """Build the fields of a constant payload; here `auto` is an ordinary field."""
-    return FieldMap(entry.key.span, auto=False, entries=tuple(_field_entries(mapping(entry.value), (), ())))
+    return _listed_fields(mapping(entry.value), entry.key.span)
+
+
+def _listed_fields(node: MappingNode, span: SourceSpan) -> FieldMap:
+    """Build the fields of a constant payload or a list's element; here `auto` is an ordinary field."""
+    return FieldMap(span, auto=False, entries=tuple(_field_entries(node, (), ())))
 
 
 def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[SourceSpan, ...]) -> Iterator[FieldEntry]:

@@ -58,8 +58,7 @@ class Layout:
     """`struct layout`. The first section is the source message.
 
     `envelope` is the section of the envelope, 0 if no routine reads fields beside the payload. `closed` are the numbers
-    of closed enums, ascending. `names` describe the slots and `messages` the sections, for
-    `explain`.
+    of closed enums, ascending. `names` describe the slots and `messages` the sections, for `explain`.
     """
 
     is_cdr: bool
