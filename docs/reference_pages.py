@@ -40,6 +40,7 @@ TABLE = (
     Section("Quality of service", "qos", "definitions.qos.else"),
     Section("Fields", "fields", "definitions.fields.else"),
     Section("Maps", "fields.NAME", "definitions.choice"),
+    Section("Each", "fields.NAME", "definitions.elements"),
     Section("Texts", "fields.NAME", "definitions.literal_text"),
     Section("Deadman", "routes.CASE.deadman", "definitions.deadman"),
     Section("Collect", "routes.CASE.collect", "definitions.collect"),

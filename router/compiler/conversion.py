@@ -161,19 +161,32 @@ def _to_list(value: tree.Node, target: List, scope: Scope) -> Plan:
     if isinstance(value, tree.ListLiteral):
         require_length(value.span, target, len(value.items))
         return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
+    lists, element = elements_of(value, target, scope)
+    fill = convert if isinstance(value, tree.Each) else _to_element
+    return Each(target, lists, fill(element, target.element, scope), value.span)
+
+
+def elements_of(value: tree.Node, target: List, scope: Scope) -> tuple[tuple[tuple[str, tree.Node], ...], tree.Node]:
+    """Return the lists of `plan.Each` for a list `value`, and one element of it.
+
+    Raises ExpressionError if it is not a list, or never as long as the target.
+    """
     element_kind, length = element_of(value.kind), length_of(value.kind)
     if element_kind is None:
         raise mismatch(value, target, how_to_fill(target, scope))
     if length is not None:
         require_length(value.span, target, length)
     if isinstance(value, tree.Each):
-        return Each(target, value.lists, convert(value.element, target.element, scope), value.span)
+        return value.lists, value.element
     element = tree.Variable(element_kind, value.span, scope.element_variable())
-    return Each(target, ((element.name, value),), _to_element(element, target.element, scope), value.span)
+    return ((element.name, value),), element
 
 
 _BY_FIELDS = "write its elements, [{FIELD: VALUE}]"
-_LIKE_MESSAGES = f"fill it from a list of messages, of which fields of the same name are copied, or {_BY_FIELDS}"
+_LIKE_MESSAGES = (
+    "fill it from a list of messages, of which fields of the same name are copied; map their fields, "
+    f"{{each: LIST, fields: {{FIELD: VALUE}}}}; or {_BY_FIELDS}"
+)
 
 
 def how_to_fill(target: List, scope: Scope) -> str:
@@ -193,7 +206,7 @@ def _to_element(element: tree.Node, target: Type, scope: Scope) -> Plan:
             hint = _LIKE_MESSAGES if isinstance(target, MessageType) else finding.hint
         elif isinstance(target, MessageType):
             both = f"{element.kind} and {target}"
-            hint = f"give {both} fields of the same name and type: elements are filled by name"
+            hint = f"map the fields, {{each: LIST, fields: ...}}, or give {both} fields of the same name and type"
         else:
             hint = "name a field of the elements, as in x.y"
         raise ExpressionError(finding.span, finding.code, f"list element: {finding.message}", hint) from error

@@ -11,12 +11,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Union
 
-from router.compiler.conversion import convert, how_to_fill, require_length, same_named, unset
+from router.compiler.conversion import convert, elements_of, how_to_fill, require_length, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.tree import Node
+from router.compiler.expressions.kinds import MessageKind, element_of
+from router.compiler.expressions.tree import ListLiteral, Node
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest, one_of
-from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Choices, Elements, Expression, FieldEntry, FieldMap
 from router.table.nodes import TEXT
 from router.types.model import Field, List, MessageType, String, Type
 from router.types.paths import ways
@@ -66,7 +67,8 @@ def _nested(entry: FieldEntry, target: MessageType) -> FieldEntry:
     for name in entry.path:
         member = holder.field(name) if isinstance(holder, MessageType) else None
         holder = member.type if member else None
-    return _text_field(entry.value, holder, entry.path, entry.path_spans) or entry
+    text = None if isinstance(entry.value, Elements) else _text_field(entry.value, holder, entry.path, entry.path_spans)
+    return text or entry
 
 
 def _text_field(
@@ -257,8 +259,10 @@ class _Builder:
             return self._automatic(member, source, path)
         return unset(member, self.span)
 
-    def _explicit(self, target: Type, value: Expression, path: str) -> Plan | None:
+    def _explicit(self, target: Type, value: Expression | Elements, path: str) -> Plan | None:
         """Return the plan of a field or list element, or None after a finding."""
+        if isinstance(value, Elements):
+            return self._each(target, value, path)
         fields = [_fields_of(item, target) for item in value.items or ()]
         if any(fields):
             return self._elements(target, value, fields, path)
@@ -309,6 +313,21 @@ class _Builder:
         self.findings += builder.findings
         return plan
 
+    def _each(self, target: Type, given: Elements, path: str) -> Each | None:
+        """Fill a list of messages with a mapping of each message of another list. Return None after a finding."""
+        try:
+            source = check(given.source, self.scope)
+            into, message = _lists_of_messages(target, source)
+            lists, element = elements_of(source, into, self.scope)
+        except ExpressionError as error:
+            self.findings.append(error.diagnostic)
+            return None
+        self.rows.append(Row(path, str(into), f"each of {_text(given.source)}", str(source.kind), automatic=False))
+        inner = build(given.fields, message, self.scope.of_element(element), given.fields.span)
+        self.rows += [replace(row, target=f"{path}[].{row.target}") for row in inner.rows]
+        self.findings += inner.findings
+        return Each(into, lists, inner.plan, given.span)
+
     def _chosen_finding(self, target: Type, choices: Choices) -> Diagnostic | None:
         """Return the finding for the first value of a map that does not fit the field."""
         values = [value for _, value in choices.values]
@@ -336,6 +355,24 @@ def _fields_of(item: Expression, target: Type) -> FieldMap | None:
     """Return the fields of a list element. `{text: value}` is the field `text` of a message that has one."""
     text = _text_field(item, target.element if isinstance(target, List) else None)
     return FieldMap(item.span, auto=False, entries=(text,)) if text else item.fields
+
+
+def _lists_of_messages(target: Type, source: Node) -> tuple[List, MessageType]:
+    """Return the target of `each`, and the type of its messages. Raises ExpressionError for another type or source."""
+    if not isinstance(target, List) or not isinstance(target.element, MessageType):
+        message = f"`each` fills a list of messages, not {target}"
+        hint = "write the list itself" if isinstance(target, List) else "write its value itself"
+        raise ExpressionError(source.span, Code.TYPE_MISMATCH, message, hint)
+    if isinstance(source, ListLiteral):
+        message, hint = (
+            "`each` takes a list of the message, not one that is written out",
+            "write its elements, [{FIELD: VALUE}]",
+        )
+        raise ExpressionError(source.span, Code.TYPE_MISMATCH, message, hint)
+    if not isinstance(element_of(source.kind), MessageKind):
+        message, hint = f"`each` takes a list of messages, not {source.kind}", "name a field that is a list of messages"
+        raise ExpressionError(source.span, Code.TYPE_MISMATCH, message, hint)
+    return target, target.element
 
 
 def _text(expression: Expression) -> str:

@@ -22,7 +22,7 @@ from router.table.addresses import LOCAL, REMOTE, Address
 from router.table.keys import Key, keys_of
 from router.table.model import Networks, RouteTable
 from router.table.model.endpoints import Endpoint, Listener
-from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Choices, Elements, Expression, FieldEntry, FieldMap
 from router.table.model.gateways import (
     Gateway,
     GatewayFormat,
@@ -39,7 +39,9 @@ from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.targets import Destination, Topic
 from router.table.nodes import (
+    EACH,
     ELSE,
+    FIELDS,
     MAP,
     TEXT,
     Entry,
@@ -59,6 +61,7 @@ from router.table.reading import (
     beside,
     boolean,
     is_choice,
+    is_elements,
     is_text,
     located,
     mapping,
@@ -447,10 +450,17 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
     for name, entry in fields.entries.items():
         inner = (*path, *name.split("."))
         inner_spans = (*spans, *_part_spans(entry.key))
-        if isinstance(entry.value, MappingNode) and not is_choice(entry.value) and not is_text(entry.value):
+        if is_elements(entry.value):
+            yield FieldEntry(inner, inner_spans, _elements(mapping(entry.value)))
+        elif isinstance(entry.value, MappingNode) and not is_choice(entry.value) and not is_text(entry.value):
             yield from _field_entries(entry.value, inner, inner_spans)
         else:
             yield FieldEntry(inner, inner_spans, _expression(entry.value, entry.key.span))
+
+
+def _elements(node: MappingNode) -> Elements:
+    source, fields = node.entries[EACH], node.entries[FIELDS]
+    return Elements(_expression(source.value, source.key.span), _fields(fields.value, fields.key.span))
 
 
 def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:

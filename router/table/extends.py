@@ -1,11 +1,11 @@
 """`extends`: merges the chain of files that make up a table into one tree.
 
 Mappings merge key by key; everything else is replaced. These mappings are also replaced: values that may be a list
-(such as the topics of a route) or a name (a QoS); a `map` of values; a route or gateway that only one of the two files
-ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and the
-reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a deadman
-is obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace each
-other. Every node keeps the span of its own file.
+(such as the topics of a route) or a name (a QoS); a `map` of values; an `each`; a route or gateway that only one of the
+two files ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and
+the reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a
+deadman is obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace
+each other. Every node keeps the span of its own file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from router.table.compose import compose
 from router.table.key_hints import as_variable
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
-from router.table.reading import is_choice
+from router.table.reading import is_choice, is_elements
 from router.table.source import TEST_ENDINGS, UNREADABLE, Source, read_source
 
 KEY = "extends"
@@ -83,7 +83,7 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
     """Return whether `over` replaces `base` instead of being merged into it; see the module's docstring."""
-    if path == ("defaults", "qos") or is_choice(over) or is_choice(base):
+    if path == ("defaults", "qos") or any(is_choice(node) or is_elements(node) for node in (over, base)):
         return True
     if path[0] not in _OF_ONE_KIND:
         return False

@@ -185,14 +185,14 @@ def _each(names: Iterable[object], key: str, rest: str = "") -> str:
 def _owners(name: str, path: Path) -> str:
     """Return a hint for a key that belongs elsewhere in a table; empty if there is no such key.
 
-    Skips definitions of the same name as the one at `path`: there are two kinds of deadmen.
+    Skips definitions of the same name as the one at `path`: there are two kinds of deadmen; and values with `each`.
     """
     definitions = table_schema()["definitions"]
     others = (*map(str, path[-1:]), "defaults")
     owners = [
         owner
         for owner, schema in definitions.items()
-        if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith("complete")
+        if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith(("complete", "elements"))
     ]
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
     named = [_NAMES[owner] for owner in near]

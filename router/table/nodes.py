@@ -191,7 +191,7 @@ def _child(node: Node, step: str | int) -> Node:
     raise LookupError(f"a {type(node).__name__} has no member {step!r}")
 
 
-MAP, ELSE, TEXT = "map", "else", "text"
+MAP, ELSE, TEXT, EACH, FIELDS = "map", "else", "text", "each", "fields"
 """Keys of values that are written as mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
 
 REASONS = ("ignore", "none", "because")

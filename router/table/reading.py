@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from router.errors import Code, FindingError, Located, SourceSpan
 from router.table.addresses import BadAddressError
-from router.table.nodes import MAP, TEXT, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.nodes import EACH, MAP, TEXT, MappingNode, Node, ScalarNode, SequenceNode
 
 V = TypeVar("V")
 R = TypeVar("R")
@@ -41,6 +41,11 @@ def mapping(node: Node | None) -> MappingNode:
 def is_choice(node: Node) -> bool:
     """Return whether a node is a choice, `{map: fix_quality, ...}`."""
     return isinstance(node, MappingNode) and isinstance(node.get(MAP), ScalarNode)
+
+
+def is_elements(node: Node) -> bool:
+    """Return whether a field is filled with `{each: LIST, fields: FIELDS}`."""
+    return isinstance(node, MappingNode) and isinstance(node.get(EACH), ScalarNode)
 
 
 def is_text(node: Node) -> bool:

@@ -42,6 +42,7 @@ _HINTS_FOR_MISSING = {
     "version": "start with 'version: 1'",
     "message": "name the protobuf message of each datagram, as in `message: PBEnvelope`",
     "oneof": "name the oneof whose members are the payload cases, as in `oneof: payload`",
+    "fields": "add the fields of one message, as in `fields: {x: x / 1000}` or `fields: auto`",
     "receive": "add the local address that receives what its client publishes: `receive: IP:PORT`",
     "directory": "add the folder for recordings, as in `directory: ../recordings`",
 }

@@ -25,7 +25,7 @@ from router.compiler.plan import Each, Items, Leaf, Record
 from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import deserialize
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model.expressions import Choices, Expression, FieldEntry, FieldMap
+from router.table.model.expressions import Choices, Elements, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextSpan
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.machine import FAILURES, machine
@@ -51,7 +51,7 @@ def chosen(subject: str, values: Mapping[str, str], otherwise: str | None = None
     return Expression("", TextSpan(SPAN), choices=choices)
 
 
-def field_map(auto: bool = False, /, **entries: str | Expression) -> FieldMap:
+def field_map(auto: bool = False, /, **entries: str | Expression | Elements) -> FieldMap:
     """`header__stamp="received_at"` is the entry `header.stamp: received_at`."""
     paths = {tuple(name.split("__")): value for name, value in entries.items()}
     values = {path: written(value) if isinstance(value, str) else value for path, value in paths.items()}
@@ -61,6 +61,11 @@ def field_map(auto: bool = False, /, **entries: str | Expression) -> FieldMap:
 def listed(*elements: FieldMap) -> Expression:
     """The expression `[{x: 1}, {y: 2}]`, a list of messages."""
     return Expression("", TextSpan(SPAN), tuple(Expression("", TextSpan(SPAN), fields=fields) for fields in elements))
+
+
+def each(source: str, fields: FieldMap) -> Elements:
+    """`{each: source, fields: fields}`."""
+    return Elements(written(source), fields)
 
 
 AUTO = field_map(True)

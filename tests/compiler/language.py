@@ -11,14 +11,14 @@ import random
 import re
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from router.table.model.expressions import Expression, FieldMap
+from router.table.model.expressions import Elements, Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.compiling import chosen, field_map, listed, written
+from tests.compiler.compiling import chosen, each, field_map, listed, written
 from tests.compiler.payloads import Wire, wire_of
 
 
@@ -185,6 +185,21 @@ FRAME: Mapping[str, Sequence[str]] = {
 }  # fmt: skip
 """The names for the payloads of a frame in expressions, in addition to the fields of the first one."""
 
+ELEMENT: Mapping[str, Sequence[str]] = {
+    "i": ("value", "many[0]", "item.value", "len(many)", "message.i32", "message.inner.value", "message.u64",
+          "message.inners[1].value"),
+    "f": ("ratio", "item.ratio", "message.f64"),
+    "b": ("message.flag", "message.is", "(ratio > 1)"),
+    "s": ("item.in", "message.name", "message.inner.in", "source"),
+    "t": ("received_at",),
+    "I": ("many", "item.many", "message.i32s", "message.inners.value"),
+    "F": ("message.f32s", "message.inners.ratio"),
+    "B": ("message.flags",),
+    "S": ("message.names",),
+}  # fmt: skip
+"""The names in the fields of `each`, for a list of Inner."""
+_ELEMENT_OF_PROTOBUF: Mapping[str, Sequence[str]] = {"i": ("grade", "message.mode"), "b": ("has(grade)",)}
+
 _INTEGERS = (0, 1, 2, 3, 7, 100, 255, 256, -1, -7, -128, 65536, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31), 1 << 32,
              1 << 53, (1 << 53) + 1, (1 << 63) - 1, 1 << 63, -(1 << 63), (1 << 64) - 1)  # fmt: skip
 _FLOATS = ("0.5", "1e6", "2.0", "(-0.0)", "1e300", "9007199254740992.0", "9.3e18", "-2.5", "nan", "inf", "0.1")
@@ -195,7 +210,7 @@ class Language:
     """A source message, and expressions over it. With `is_wild`, some expressions have the wrong kind.
 
     `for_each` is one of ITEMS, or empty. `order` is the order of the fields of a ROS message. `is_frame`: several
-    payloads are one message.
+    payloads are one message. `is_element`: the expressions are the fields of `each`, for a list of Inner.
     """
 
     is_ros: bool
@@ -203,6 +218,7 @@ class Language:
     for_each: str = ""
     order: int = 0
     is_frame: bool = False
+    is_element: bool = False
 
     @property
     def source(self) -> MessageType:
@@ -225,22 +241,34 @@ class Language:
             return _bracketed(noise.choice(_INTEGERS))
         if kind == "f" and noise.randrange(3) == 0:
             return noise.choice(_FLOATS)
-        if self.for_each and noise.randrange(2):
+        if self.for_each and not self.is_element and noise.randrange(2):
             of_item: list[str] = [*ITEMS[self.for_each].get(kind, ()), *(("index", "count") if kind == "i" else ())]
             if of_item:
                 return noise.choice(of_item)
         if self.is_frame and FRAME[kind] and noise.randrange(2):
             return noise.choice(FRAME[kind])
+        if self.is_element:
+            seen: list[str] = [*ELEMENT[kind], *(("index", "count") if self.for_each and kind == "i" else ())]
+            return noise.choice([*seen, *(() if self.is_ros else _ELEMENT_OF_PROTOBUF.get(kind, ()))])
         known: list[str] = [*_SHARED[kind], *(_ROS if self.is_ros else _PROTOBUF)[kind]]
         return noise.choice(known)
 
-    def filled(self, noise: random.Random, target: Type) -> Expression:
-        """An expression that fills a field, or that is refused for its range or length."""
+    def filled(self, noise: random.Random, target: Type) -> Expression | Elements:
+        """What fills a field, or is refused for its range or length."""
         if noise.randrange(12) == 0 and not isinstance(_innermost(target), MessageType):
             return self._choices(noise, target)
         if isinstance(target, List) and isinstance(target.element, MessageType) and noise.randrange(4) == 0:
+            if noise.randrange(2):
+                inner = replace(self, is_element=True)
+                return each(noise.choice(self._lists_of_inner()), inner._fields(noise, target.element))
             return listed(*(self._fields(noise, target.element) for _ in range(noise.choice((1, 2)))))
         return written(self._value(noise, target, noise.choice((1, 2, 2, 3, 4))))
+
+    def _lists_of_inner(self) -> Sequence[str]:
+        return (
+            *(("message.inners",) if self.is_element else ("inners", "message.inners")),
+            *(("items[1].inners", "items.inner") if self.is_frame else ()),
+        )
 
     def _fields(self, noise: random.Random, target: MessageType) -> FieldMap:
         """Fields of a list element; a oneof gets one member."""
@@ -248,9 +276,10 @@ class Language:
         return field_map(**{member.name: self.filled(noise, member.type) for member in members})
 
     def _value(self, noise: random.Random, target: Type, depth: int) -> str:
-        if not self.is_ros and str(target) in _OF_PROTOBUF and noise.randrange(2):
+        if not self.is_ros and not self.is_element and str(target) in _OF_PROTOBUF and noise.randrange(2):
             return noise.choice(_OF_PROTOBUF[str(target)])
-        return self._completed(noise, noise.choice(_of_frames(target) if self.is_frame else _filling(target)), depth)
+        templates = _of_frames(target) if self.is_frame else _filling(target)
+        return self._completed(noise, noise.choice(_in_elements(templates) if self.is_element else templates), depth)
 
     def _completed(self, noise: random.Random, template: str, depth: int) -> str:
         parts = template.split("{")
@@ -260,9 +289,9 @@ class Language:
         otherwise = self._value(noise, target, 2)
         if not self.is_ros and noise.randrange(2):
             values = {"OFF": 1, "ON": 1, "LOUD": 1, "LESS": 1}
-            subject, is_whole = "mode", noise.randrange(2) == 1
+            subject, is_whole = "message.mode", noise.randrange(2) == 1
             if noise.randrange(2):
-                values, subject = {"NONE": 1, "FAIR": 1, "GOOD": 1, "POOR": 1}, "grade"
+                values, subject = {"NONE": 1, "FAIR": 1, "GOOD": 1, "POOR": 1}, "message.grade"
         elif noise.randrange(2):
             values, subject, is_whole = {"true": 1, "false": 1}, self.text(noise, "b", 2), True
         else:
@@ -333,6 +362,14 @@ def _of_frames(target: Type) -> Sequence[str]:
             return (*_filling(target), "items[1].inners", "[items[1].inner, inner]", "items.inner")
         case _:
             return _filling(target)
+
+
+def _in_elements(templates: Sequence[str]) -> Sequence[str]:
+    """The templates with the fields of the source message as `message.inner`, for the fields of `each`."""
+    return [_FIELDS.sub(r"message.\1", template) for template in templates]
+
+
+_FIELDS = re.compile(r"(?<![\w.{])(inners?|pairs|names?|raw)\b")
 
 
 def _innermost(declared: Type) -> Type:

@@ -22,8 +22,9 @@ from router.compiler.lowering.sources import MOST_CONDITION_OPERATIONS, Datagram
 from router.compiler.mapping import build
 from router.declared import MOST_OPEN, MOST_SECTIONS_DEEP, Op, ReadKind, Scalar, Sign
 from router.errors import Code
+from router.table.model.expressions import FieldMap
 from router.types.model import Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.compiling import AUTO, SPAN, field_map, scope_of, written
+from tests.compiler.compiling import AUTO, SPAN, each, field_map, scope_of, written
 from tests.compiler.conftest import CheckText
 from tests.compiler.payloads import made_wire, wire_of
 from tests.compiler.test_expressions import MODE
@@ -296,12 +297,17 @@ def of_many(when: str, *, is_bounded: bool = True) -> Routine:
 
 
 def test_lists_in_lists_are_bounded() -> None:
-    declared = MessageType("made/msg/Leaf", (Field("numbers", List(I32)),))
+    declared, fields = MessageType("made/msg/Leaf", (Field("numbers", List(I32)),)), field_map(numbers="numbers")
     for _ in range(2, 9):
         declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
-        assert findings("many", declared) == []
-    declared = MessageType("made/msg/Many", (Field("many", List(declared)),))
-    assert findings("many", declared) == ["more than 8 lists are nested here"]
+        fields = field_map(many=each("many", fields))
+        assert findings("many", declared) == findings("many", declared, fields) == []
+    declared, fields = (
+        MessageType("made/msg/Many", (Field("many", List(declared)),)),
+        field_map(many=each("many", fields)),
+    )
+    too_many = ["more than 8 lists are nested here"]
+    assert findings("many", declared) == findings("many", declared, fields) == too_many
 
 
 def test_text_that_is_put_together_is_bounded() -> None:
@@ -345,10 +351,10 @@ def seeds(depth: int) -> list[str]:
     return [*(["seed", "tree"] * depth)[:depth], "name"]
 
 
-def findings(name: str, target: MessageType) -> list[str]:
+def findings(name: str, target: MessageType, fields: FieldMap = AUTO) -> list[str]:
     _, envelope = made_wire()
     case = envelope.cases[name]
-    plan = build(AUTO, target, scope_of(case.type), SPAN).plan
+    plan = build(fields, target, scope_of(case.type), SPAN).plan
     source = Datagram(case)
     try:
         source.published(source.lowering(), plan)

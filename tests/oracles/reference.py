@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, Union
 
-from router.table.model.expressions import Expression, FieldMap
+from router.table.model.expressions import Elements, Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.oracles.reference_expressions import Context, elements_of, meaning_of, value_of
 from tests.oracles.reference_kinds import (
@@ -90,7 +90,7 @@ def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, con
     def fill_field(field: Field) -> Value:
         given = tree.get(field.name)
         same_named = auto.read(field.name) if auto and auto.type.field(field.name) else None
-        if isinstance(given, Expression):
+        if isinstance(given, (Expression, Elements)):
             return _of_expression(given, field.type, context)
         if given is None:
             return converted(same_named, field.type)
@@ -102,7 +102,11 @@ def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, con
     return {field.name: value for field, value in zip(fields, values, strict=True)}
 
 
-def _of_expression(given: Expression, target: Type, context: Context) -> Value:
+def _of_expression(given: Expression | Elements, target: Type, context: Context) -> Value:
+    if isinstance(given, Elements):
+        assert isinstance(target, List)
+        elements = elements_of(meaning_of(given.source, context), context)
+        return _listed([partial(_of_element, given.fields, target.element, each, context) for each in elements], target)
     if given.fields is not None:
         assert isinstance(target, MessageType)
         return fill_given(given.fields, target, context)
@@ -112,6 +116,11 @@ def _of_expression(given: Expression, target: Type, context: Context) -> Value:
     if isinstance(target, (List, Bytes)):
         return _to_list(elements_of(meaning, context), target)
     return converted(value_of(meaning, context), target)
+
+
+def _of_element(fields: FieldMap, target: Type, element: Computation, context: Context) -> Value:
+    assert isinstance(target, MessageType)
+    return fill_given(fields, target, context.of_element(element()))
 
 
 def initial(declared: Type, default: object = None) -> Value:
@@ -168,13 +177,18 @@ _OCTET = Int(8, signed=False)
 def _to_list(elements: Sequence[Computation], target: List | Bytes) -> Value:
     """A list or bytes, from elements that are not computed yet."""
     declared = target.element if isinstance(target, List) else _OCTET
+    return _listed([partial(_converted_to, declared, each) for each in elements], target)
+
+
+def _listed(elements: Sequence[Computation], target: List | Bytes) -> Value:
+    """The same from elements that have the type of the target's."""
     least, most = (target.length or 0, _most_elements(target)) if isinstance(target, List) else (0, target.bound)
 
     def check_length() -> None:
         if len(elements) < least or (most is not None and len(elements) > most):
             raise Refused(MAPPING_ERROR)
 
-    _, *made = all_of([check_length, *(partial(_converted_to, declared, each) for each in elements)])
+    _, *made = all_of([check_length, *elements])
     return made if isinstance(target, List) else bytes(made)
 
 

@@ -58,7 +58,8 @@ from tests.oracles.reference_kinds import (
 class Context:
     """The environment of expressions: a message, its sender, its time (ns since 1970), and constants by holder.
 
-    `names` are additional values with their kinds, which take precedence over fields of the same name.
+    `names` are additional values with their kinds, which take precedence over fields of the same name. In `each`, the
+    view is a message of a list, and `message` the whole source message.
     """
 
     view: View
@@ -67,6 +68,17 @@ class Context:
     enums: Collection[Enum]
     ros_types: Collection[MessageType]
     names: Mapping[str, tuple[Any, Kind]] = field(default_factory=dict)
+    message: View | None = None
+
+    def whole(self) -> View:
+        """The source message."""
+        return self.view if self.message is None else self.message
+
+    def of_element(self, element: View) -> Context:
+        """The environment of the fields of `each`, for a message of its list."""
+        names = {name: named for name, named in self.names.items() if element.type.field(name) is None}
+        names["item"] = (element, Message(element.type))
+        return replace(self, view=element, names=names, message=self.whole())
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,7 +409,7 @@ class _Reader:
         values = dict(expected.values) if isinstance(expected, Enum) else {}
         match name:
             case "message":
-                return self._message()
+                return Meaning(Message(self.context.whole().type), lambda context: context.whole())
             case "source":
                 return Meaning(Text(), lambda context: context.source)
             case "received_at":

@@ -181,26 +181,32 @@ routes:
     assert [topic.topic.value for topic in routes["arm_ctrl"].source_topics] == ["b"]
 
 
-def test_a_map_of_values_and_a_quality_of_service_replace(tmp_path: Path) -> None:
+def test_a_map_of_values_an_each_and_a_quality_of_service_replace(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text(
         GOOD
         + """\
   arm_ctrl:
     source: {topic: a, type: comms/msg/A}
     destinations: basestation
-    fields: {a: {map: mode, ONE: 1, else: 0}, b: {text: base}, c: {x: 1, y: 2}}
+    fields: {a: {map: mode, ONE: 1, else: 0}, b: {text: base}, c: {x: 1, y: 2}, d: {each: p, fields: {x: 1}}}
 defaults: {qos: {profile: sensor_data, depth: 7}}
 """
     )
     text = """\
 extends: base.yaml
 routes:
-  arm_ctrl: {fields: {a: {map: other, TWO: 2, else: 0}, b: {map: mode, ONE: {text: over}, else: source}, c: {y: 3}}}
+  arm_ctrl:
+    fields:
+      a: {map: other, TWO: 2, else: 0}
+      b: {map: mode, ONE: {text: over}, else: source}
+      c: {y: 3}
+      d: {each: q, fields: {y: 2}}
 defaults: {qos: {reliability: best_effort}}
 """
     route = good(tmp_path, text).routes[-1]
     assert str(route.fields) == (
-        "{a: {map: other, TWO: 2, else: 0}, b: {map: mode, ONE: 'over', else: source}, c.x: 1, c.y: 3}"
+        "{a: {map: other, TWO: 2, else: 0}, b: {map: mode, ONE: 'over', else: source}, c.x: 1, c.y: 3, "
+        "d: {each: q, fields: {y: 2}}}"
     )
     [topic] = route.source_topics
     assert topic.qos is not None

@@ -88,7 +88,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
     return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
 
 
-_MISSPELT = 0.9
+_MISSPELT = 0.8
 """Minimum similarity of a name that can only be a misspelt field of the message."""
 
 
@@ -135,7 +135,7 @@ def _of_an_enum(text: str, scope: Scope, expected: Type | None = None) -> str:
 
 def _given(text: str, span: SourceSpan, scope: Scope) -> Node:
     if text == MESSAGE:
-        return scope.whole_message(span)
+        return scope.source_message(span)
     return Variable(StringKind() if text == SOURCE else TimeKind(), span, text)
 
 
@@ -174,7 +174,7 @@ def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
     if isinstance(member and member.type, MessageType):
         return None
     span = text.span(holder)
-    return scope.whole_message(span) if holder.id == MESSAGE else scope.whole_envelope(span)
+    return scope.source_message(span) if holder.id == MESSAGE else scope.whole_envelope(span)
 
 
 def is_null(node: ast.expr, scope: Scope) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 
 from router.compiler.expressions.kinds import MessageKind, kind_of
-from router.compiler.expressions.tree import ENVELOPE, MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
+from router.compiler.expressions.tree import ENVELOPE, ITEM, MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
 from router.errors import Code, FindingError, SourceSpan
 from router.types.model import Enum, Field, List, MessageType, String
 from router.types.protobuf import Envelope
@@ -25,7 +25,8 @@ class Scope:
     additional variables, which take precedence over fields. `given` are those of MESSAGE, SOURCE and RECEIVED_AT that
     are available. `envelope` is that of a message from UDP, which ENVELOPE then names. `sources` are the possible
     values of SOURCE, empty if they are not known. `absent` are names that a missing key of the route would define, each
-    with message and hint.
+    with message and hint. `element` is the message in a list whose fields are visible instead of those of the source
+    message; `message` is then its type, and `source` the type of the source message.
     """
 
     message: MessageType
@@ -36,6 +37,8 @@ class Scope:
     envelope: Envelope | None = None
     sources: Collection[str] = ()
     absent: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    element: Node | None = None
+    source: MessageType | None = None
     _elements: Iterator[int] = field(default_factory=lambda: count(1))
 
     def element_variable(self) -> str:
@@ -67,10 +70,23 @@ class Scope:
         kinds = [(f"{name}.", node.kind) for name, node in self.names.items()]
         beside = [(f"{ENVELOPE}.", self.envelope.beside)] if self.envelope is not None else []
         variables = [(prefix, kind.type) for prefix, kind in kinds if isinstance(kind, MessageKind)]
+        if self.source is not None:
+            variables = [(f"{MESSAGE}.", self.source), *(found for found in variables if found[0] != f"{ITEM}.")]
         return [("", self.message), *variables, *beside]
 
-    def whole_message(self, span: SourceSpan) -> Variable:
-        return Variable(MessageKind(self.message), span, MESSAGE)
+    def whole_message(self, span: SourceSpan) -> Node:
+        """Return the message whose fields are visible."""
+        return self.source_message(span) if self.element is None else replace(self.element, span=span)
+
+    def source_message(self, span: SourceSpan) -> Variable:
+        return Variable(MessageKind(self.source or self.message), span, MESSAGE)
+
+    def of_element(self, element: Node) -> Scope:
+        """Return the scope of expressions over `element`, a message in a list. Its fields hide variables around it."""
+        assert isinstance(element.kind, MessageKind)  # noqa: S101 - the caller ensures it
+        message = element.kind.type
+        names = {name: node for name, node in self.names.items() if message.field(name) is None} | {ITEM: element}
+        return replace(self, message=message, names=names, element=element, source=self.source or self.message)
 
     def whole_envelope(self, span: SourceSpan) -> Variable | None:
         """Return the fields beside the payload; None for a message that is not from UDP."""

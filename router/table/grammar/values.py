@@ -134,7 +134,11 @@ VALUES: Schema = {
         "pattern": rf"^{_NAME}(?:\.{_NAME})*$",
         "errorMessage": "must be a field's name, or several with '.' between them",
     },
-    "field_value": one_of("object", _CHOICE_OR_FIELDS, one_of("array", ref("list"), ref("expression"))),
+    "field_value": one_of("object", {
+        "if": {"required": ["each"], "properties": {"each": {"type": _SCALAR}}},
+        "then": ref("elements"),
+        "else": _CHOICE_OR_FIELDS,
+    }, one_of("array", ref("list"), ref("expression"))),
     "list": key(
         "List", "The elements of a list: an expression each, or the fields of a message.",
         {"type": "array", "items": one_of("object", _CHOICE_OR_FIELDS, {
@@ -142,6 +146,18 @@ VALUES: Schema = {
         })},
         ["gyro_x", "gyro_y"], [{"id": 3, "forward": "linear.x"}, {"id": 4}],
     ),
+    "elements": key("Each", "Fills a list of messages with one message for each of another list.", mapping({
+        "each": key(
+            "Each", "The list of messages: a field, or an expression.",
+            {"type": _SCALAR, "minLength": 1}, "robots_blue",
+        ),
+        "fields": key(
+            "Fields",
+            "The fields of one message. Names are fields of the message in the other list; `item` is that message, and "
+            "`message` the source message.",
+            {"allOf": [ref("fields")]}, {"x": "x / 1000"},
+        ),
+    }, required=["each", "fields"])),
     "nested_fields": key(
         "Fields", "The fields of a nested message, each with its expression.",
         {"type": "object", "minProperties": 1, **_FIELDS},

@@ -51,6 +51,21 @@ class Choices:
 
 
 @dataclass(frozen=True, slots=True)
+class Elements:
+    """`{each: detections, fields: {x: x / 1000}}`: each message of the list `source` fills one of the target's list."""
+
+    source: Expression
+    fields: "FieldMap"
+
+    @property
+    def span(self) -> SourceSpan:
+        return self.source.span
+
+    def __str__(self) -> str:
+        return f"{{each: {self.source}, fields: {self.fields}}}"
+
+
+@dataclass(frozen=True, slots=True)
 class FieldEntry:
     """`linear_acceleration: {x: accel_x}` has the path ("linear_acceleration", "x"); dotted keys are split.
 
@@ -59,7 +74,7 @@ class FieldEntry:
 
     path: tuple[str, ...]
     path_spans: tuple[SourceSpan, ...]
-    value: Expression
+    value: Expression | Elements
 
 
 @dataclass(frozen=True, slots=True)
