@@ -23,16 +23,23 @@ class NativeDeadman:
     """The deadman of one route, which sends to `endpoints`. `address` is that of its `struct deadman`.
 
     One of gateway clients publishes on topics instead. Its group is served by a thread that may block; no call waits
-    for that.
+    for that. `keep` is kept alive for it.
     """
 
     def __init__(
-        self, library: ctypes.CDLL, group: int, address: int, endpoints: Collection[str], keep: Sequence[Any] = ()
+        self,
+        library: ctypes.CDLL,
+        group: int,
+        address: int,
+        endpoints: Collection[str],
+        outlets: Sequence[Any] = (),
+        keep: object = None,
     ) -> None:
         self.address = address
         self.endpoints = endpoints
-        self.outlets = keep
+        self.outlets = outlets
         """The senders or publications of the endpoints."""
+        self._keep = keep
         self._library = library
         self._group = group
         self._successor: NativeDeadman | None = None
@@ -124,25 +131,29 @@ def open_deadman(
     address: Callable[[Any], Any],
     endpoints: Collection[str],
     outlets: Sequence[Any],
+    keep: object = None,
 ) -> NativeDeadman:
     """Open a deadman with the arguments of an opening of an image. Raises MemoryError.
 
-    `address` converts arguments that are symbols. `outlets` are the senders or publications of the endpoints.
+    `address` converts arguments that are symbols. `outlets` are the senders or publications of the endpoints. `keep` is
+    kept alive for it.
     """
     group, *others, destinations = arguments
     array = (c.DeadmanDestination * len(destinations))(*(_destination(*each, address=address) for each in destinations))
     timers = address(group)
     opened = open_native(library, "deadman_open", timers, *others, array, len(array))
-    return NativeDeadman(library, timers, opened, endpoints, outlets)
+    return NativeDeadman(library, timers, opened, endpoints, outlets, keep)
 
 
 def _destination(
     kind: str, outlet: Any, datagrams: Collection[bytes], *others: Any, address: Callable[[Any], Any]
 ) -> c.DeadmanDestination:
-    sent, send_errors, number, follows, is_heard, last_seen, within, disobeyed, stopping = others
+    sent, send_errors, number, follows, is_heard, last_seen, within, disobeyed, stopping, sequence, filled = others
     array = (c.DeadmanDatagram * len(datagrams))(*(c.DeadmanDatagram(data=each, size=len(each)) for each in datagrams))
+    fields = (c.BesideField * len(filled))(*(c.BesideField(*each) for each in filled))
     to = c.DeadmanDestination(
         datagrams=array,
+        beside=c.Beside(sequence=address(sequence) if filled else None, fields=fields, count=len(fields)),
         count=len(datagrams),
         sent=sent,
         send_errors=send_errors,

@@ -126,7 +126,8 @@ class LoadedImage:
         if function == "deadman_open":
             outlets = [self.image.symbols[each[1][0]] for each in arguments[-1]]
             names, objects = [str(name) for _, name in outlets], [self._objects[each] for each in outlets]
-            return open_deadman(self._library, arguments, self._argument, names, objects)
+            sequences = [self._objects.get(self.image.symbols[each[-2][0]]) for each in arguments[-1] if each[-2]]
+            return open_deadman(self._library, arguments, self._argument, names, objects, sequences)
         used = [self._objects.get(self.image.symbols[value[0]]) for value in arguments if _is_symbol(value)]
         address = open_native(self._library, function, *map(self._argument, arguments))
         return OwnedPointer(getattr(self._library, function.removesuffix("_open") + "_close"), address, used)

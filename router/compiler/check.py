@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from router.compiler.beside import check_beside, unfilled
 from router.compiler.brakes import brake_findings
 from router.compiler.checked import CheckedRoute
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
@@ -102,6 +103,7 @@ def check_table(
     board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
     boards = _boards(table, schema, envelope, board_limit)
     lookup = Lookup(table, schema, envelope, definitions, board_limit, boards)
+    lookup.beside = check_beside(lookup)
     routes = check_routes(lookup)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
@@ -112,7 +114,7 @@ def check_table(
         *(lock.findings(table.envelope.lock) if lock and table.envelope else ()),
         *network_findings(table),
         *_board_findings(table, boards),
-        *_envelope_findings(table, schema, envelope, routes),
+        *_envelope_findings(lookup, routes),
         *lookup.findings,
         *clash_findings(table),
         *brake_findings(table, routes),
@@ -150,29 +152,28 @@ def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Ite
             yield Diagnostic(table.endpoints[name].span, Code.TOO_LARGE, what, hint)
 
 
-def _envelope_findings(
-    table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Iterable[CheckedRoute]
-) -> Iterator[Diagnostic]:
-    """Yield findings for fields beside the payload, which are empty in envelopes that the router makes.
+def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Diagnostic]:
+    """Yield findings for fields beside the payload that nothing fills in envelopes that the router makes.
 
     It makes them from messages from ROS and for deadmen; forwarded ones keep their fields.
     """
-    names = [name for checked in routes for name in _made_for(checked) if name in table.endpoints]
-    if table.envelope is None or not names:
-        return
-    span = table.envelope.message.span
-    beside = envelope.beside.fields
-    for name in (member.name for member in beside if member.is_required):
-        message = f"nothing fills '{name}', which {envelope.name} requires, in envelopes for '{names[0]}'"
-        yield Diagnostic(span, Code.MISSING_KEY, message, f"see {schema.span(envelope.name, name)}; make it optional")
-    board = next((name for name in names if table.endpoints[name].kind is EndpointKind.BOARD), None)
-    empty = [member.name for member in beside if not member.is_required]
-    if board is not None and empty and table.envelope.because is None:
-        message = (
-            f"nothing fills {', '.join(empty)} of {envelope.name} in envelopes for '{board}' from ROS or deadman timers"
-        )
-        hint = "a board that checks them obeys only forwarded envelopes; if none does, add `because: why` to 'envelope'"
-        yield Diagnostic(span, Code.EMPTY_FIELD, message, hint)
+    table, schema, envelope = lookup.table, lookup.schema, lookup.envelope
+    for name in dict.fromkeys(name for checked in routes for name in _made_for(checked)):
+        endpoint = table.endpoints.get(name)
+        if table.envelope is None or endpoint is None or (endpoint.beside and name not in lookup.beside):
+            continue  # or `set` has findings already
+        empty = unfilled(envelope.beside, lookup.beside.get(name))
+        for required in (member.name for member in empty if member.is_required):
+            message = f"nothing fills '{required}', which {envelope.name} requires, in envelopes for '{name}'"
+            hint = f"see {schema.span(envelope.name, required)}; write `set: {{{required}: VALUE}}` in the endpoint"
+            yield Diagnostic(endpoint.span, Code.MISSING_KEY, message, hint)
+        names = [member.name for member in empty if not member.is_required]
+        if endpoint.kind is EndpointKind.BOARD and names and table.envelope.because is None:
+            made = f"envelopes for '{name}' from ROS or deadman timers"
+            what = f"nothing fills {', '.join(names)} of {envelope.name} in {made}"
+            more = ", ..." * (len(names) > 1)
+            hint = f"write `set: {{{names[0]}: VALUE{more}}}` in the endpoint, or `because: why` in 'envelope'"
+            yield Diagnostic(endpoint.span, Code.EMPTY_FIELD, what, hint)
 
 
 def _made_for(checked: CheckedRoute) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from router.compiler.compiled_table import DeadmanPlan, ObeyedPlan
+from router.compiler.compiled_table import Beside, DeadmanPlan, ObeyedPlan
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
@@ -26,7 +26,7 @@ class Target:
 
     `endpoint` is set for a destination, `type` for a published topic. Without a `plan`, the datagram is forwarded
     unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command to this
-    target feeds (its own route's) or disarms.
+    target feeds (its own route's) or disarms. `beside` is what `set` of the endpoint fills in messages with a plan.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
     without a `when`, or without a `plan`. `places` are the places of the table where a message may be rejected, by
@@ -42,6 +42,7 @@ class Target:
     rows: tuple[Row, ...] = ()
     declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
+    beside: Beside | None = None
     condition: Routine = ()
     message: Routine = ()
     places: tuple[str, ...] = ()

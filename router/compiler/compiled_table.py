@@ -8,6 +8,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import Counters
+from router.declared import BesideEncoding, BesideValue
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, Inbound
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from router.compiler.checked import Target
     from router.compiler.expressions.tree import Node
     from router.compiler.lowering import Lowered
+    from router.compiler.mapping import Row
+    from router.compiler.plan import Record
 
 STRANGER = None
 """The source of a datagram whose sender is not an endpoint of the table."""
@@ -77,13 +80,55 @@ class ObeyedPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class Changing:
+    """A field beside the payload that is filled when a message is sent: `struct beside_field`."""
+
+    size: int
+    encoding: BesideEncoding
+    value: BesideValue
+    bits: int = 64
+    is_signed: bool = False
+    unit: int = 1
+    modulus: int = 0
+    scale: float = 0.0
+    offset: int = 0
+
+    @property
+    def members(self) -> tuple[int | float, ...]:
+        """All values, in the order of the structure."""
+        return (
+            *(self.offset, self.size, int(self.encoding), int(self.value)),
+            *(self.bits, int(self.is_signed), 0, self.unit, self.modulus, self.scale),
+        )
+
+    @property
+    def zero(self) -> bytes:
+        """The bytes of the field until it is filled."""
+        is_padded = self.encoding in (BesideEncoding.VARINT, BesideEncoding.ZIGZAG)
+        return b"\x80" * (self.size - 1) + b"\0" if is_padded else bytes(self.size)
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What the router puts before the payload in its messages for an endpoint, and what is filled in that.
+
+    `plan` has all fields beside the payload, `rows` describe them for `explain`.
+    """
+
+    data: bytes
+    changing: tuple[Changing, ...]
+    rows: tuple[Row, ...]
+    plan: Record
+
+
+@dataclass(frozen=True, slots=True)
 class DeadmanPlan:
     """A route's deadman: the datagrams that are sent if no fresh command was sent for `timeout` (all times in ns).
 
     `datagrams` are by endpoint, in the order of sending. With `at_start`, they are also sent when the router starts.
     Endpoints in `following` get no commands from the route, and are armed and disarmed with the others. `disarmed_by`
     are names of routes, not the payload cases of the table. `watched` are the commands of the route: each source, with
-    the payload case.
+    the payload case. `beside` is what `set` of an endpoint fills in these datagrams.
     """
 
     route: str
@@ -95,6 +140,7 @@ class DeadmanPlan:
     disarmed_by: tuple[str, ...] = field(default=(), compare=False)
     watched: frozenset[tuple[str, str]] = field(default=frozenset(), compare=False)
     obeyed: ObeyedPlan | None = None
+    beside: Mapping[str, Beside] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

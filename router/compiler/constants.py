@@ -1,4 +1,4 @@
-"""Messages of constants, which deadmen send in place of commands.
+"""Messages of constants, which deadmen send in place of commands, and constants beside the payload.
 
 They are lowered like any message, and if anything has to be computed, the machine does it once, when the table is
 checked.
@@ -7,6 +7,8 @@ checked.
 from __future__ import annotations
 
 import ctypes
+
+from google.protobuf.descriptor import Descriptor
 
 from router import declared as c
 from router.compiler.lowering.arrays import Arrays
@@ -22,12 +24,17 @@ from router.types.protobuf import PayloadCase
 
 def envelope_of(plan: Record, case: PayloadCase) -> bytes:
     """Write the envelope of a payload. Raises FindingError for a value that does not exist or does not fit."""
-    return _written(Constants().lowered(plan, case))
+    return _written(Constants().envelope(plan, case))
+
+
+def fields_of(plan: Record, descriptor: Descriptor) -> bytes:
+    """Write the fields of a protobuf message. Raises FindingError likewise."""
+    return _written(Constants().fields(plan, descriptor))
 
 
 def cdr_of(plan: Record) -> bytes:
     """Write a ROS message as CDR. Raises FindingError likewise."""
-    return _written(Constants().lowered(plan, None))
+    return _written(Constants().cdr(plan))
 
 
 def _written(message: LoweredConstant) -> bytes:
@@ -52,4 +59,4 @@ def _computed(message: LoweredConstant) -> bytes:
         why = why_refused(machine.refusal, ctypes.string_at(machine.refused.bits, machine.refused.size))
     finally:
         native.machine_close(ctypes.byref(machine))
-    raise FindingError(message.places[at.value].span, Code.BAD_VALUE, f"a deadman cannot send this: {why}")
+    raise FindingError(message.places[at.value].span, Code.BAD_VALUE, f"this cannot be sent: {why}")

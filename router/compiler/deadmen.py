@@ -56,13 +56,16 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     others = frozenset(to.value for to in deadman.to) - commanded
     following = others if len(others) < len(deadman.to) else frozenset()
     trims = {name for name, endpoint in lookup.table.endpoints.items() if endpoint.trim_trailing_zeros}
-    by_endpoint = [
-        (to.value, tuple(trimmed(data) if to.value in trims else data for data in datagrams)) for to in deadman.to
-    ]
+    beside = {to.value: lookup.beside[to.value] for to in deadman.to if to.value in lookup.beside}
+    by_endpoint = []
+    for to in deadman.to:
+        before = beside[to.value].data if to.value in beside else b""
+        whole = (before + data for data in datagrams)
+        by_endpoint.append((to.value, tuple(trimmed(data) if to.value in trims else data for data in whole)))
     sources = *(source.value for source in route.sources), *(topic.topic.value for topic in route.source_topics)
     watched = frozenset((source, route.case.value) for source in sources)
     plan = deadman_plan(route.name, deadman, by_endpoint)
-    return replace(plan, following=following, disarmed_by=disarmed_by, watched=watched)
+    return replace(plan, following=following, disarmed_by=disarmed_by, watched=watched, beside=beside)
 
 
 def _require_deadman(lookup: Lookup, route: Route) -> None:

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from router import inputs
+from router.compiler.compiled_table import Beside
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.expressions.operators import presence_hint
@@ -72,7 +73,8 @@ NO_NAMES: Mapping[str, Node] = {}
 class Lookup:
     """Looks up the names of one table and collects findings.
 
-    `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint.
+    `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint, `beside` what `set` of
+    an endpoint fills.
     """
 
     table: RouteTable
@@ -82,6 +84,7 @@ class Lookup:
     board_limit: int
     boards: Mapping[str, BoardLimits]
     findings: list[Diagnostic] = field(default_factory=list)
+    beside: Mapping[str, Beside] = field(default_factory=dict)
 
     def report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
         self.findings.append(Diagnostic(span, code, message, hint))

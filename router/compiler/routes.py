@@ -256,7 +256,8 @@ def _subscription(
         mapping = build(fields, case.type, scope, span, whole, _element_type(for_each) if for_each else ros_type)
         lookup.findings += mapping.findings
         target = _destination(lookup, route, destination, endpoint, scope)
-        targets.append(replace(target, plan=mapping.plan, rows=tuple(mapping.rows)))
+        beside = lookup.beside.get(target.label)
+        targets.append(replace(target, plan=mapping.plan, rows=tuple(mapping.rows), beside=beside))
     return CheckedSubscription(topic, ros_type, when, for_each, stamp, tuple(targets))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from router import declared as c
 from router.compiler.checked import Target
-from router.compiler.compiled_table import CompiledTable, DeadmanPlan, RoutePlan, TopicPlan
+from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, RoutePlan, TopicPlan
 from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
@@ -47,6 +47,10 @@ class Openings:
     def _argument(self, *symbol: str | None) -> tuple[int]:
         return (Symbols.number(self.symbols.address(*symbol)),)
 
+    def sequence(self, endpoint: str) -> int:
+        """Open the sequence that numbers the router's messages for an endpoint."""
+        return self._open(("sequence", endpoint), "sequence_open")
+
     # targets
 
     def sender(self, endpoint: str) -> int:
@@ -71,15 +75,19 @@ class Openings:
         return self._open(("pacer", endpoint), "pacer_open", bandwidth, of=(self._argument("sender", endpoint),))
 
     def deferral(self, plan: RoutePlan, target: Target, source: str | None) -> int:
-        """Open what holds back messages of a source for a target, as long as the destination is the same."""
+        """Open what holds back messages of a source for a target.
+
+        It is passed on as long as the destination is the same, and what is filled in its messages when they are sent.
+        """
         symbol = "deferral", plan.route, plan.topic, source, target.label
         if target.is_topic:
             (topic,) = (each for each in self.program.publishers if each.label == target.label)
             return self._open(symbol, "deferral_open", None, of=_settings(topic))
+        filled = _filled(target.beside)
         if self.program.table.endpoints[target.label].bandwidth is None:
-            return self._open(symbol, "deferral_open", None, of=(self._argument("sender", target.label),))
+            return self._open(symbol, "deferral_open", None, of=(self._argument("sender", target.label), filled))
         self._pacer(target.label)
-        return self._open(symbol, "deferral_open", self._argument("pacer", target.label))
+        return self._open(symbol, "deferral_open", self._argument("pacer", target.label), of=(filled,))
 
     def collector(self, plan: RoutePlan) -> int:
         """Open the collector that makes frames of the route's payload for its topics."""
@@ -91,6 +99,9 @@ class Openings:
 
     def deadman(self, plan: DeadmanPlan) -> int:
         """Open the deadman of a route."""
+        for endpoint, beside in plan.beside.items():
+            if beside.changing:
+                self.sequence(endpoint)
         return self._open(("deadman", plan.route), "deadman_open", *self._deadman(plan, "timers", "sender"))
 
     def client_deadman(self, plan: DeadmanPlan) -> int:
@@ -146,6 +157,7 @@ def deadman_arguments(
             name in plan.following,
             *((True, counters.index("endpoint_silence_seconds", name)) if kind == "sender" else (False, 0)),
             *_obeyed(plan, name, counters),
+            *_beside(plan.beside.get(name), name, argument),
         )
         for name, datagrams in plan.datagrams
     )
@@ -167,6 +179,17 @@ def _obeyed(plan: DeadmanPlan, name: str, counters: Counters) -> tuple[int, int,
         return 0, 0, 0
     disobeyed = counters.index("deadman_disobeyed", plan.route, name)
     return plan.obeyed.within, disobeyed, counters.index("deadman_stopping_seconds", plan.route, name)
+
+
+def _beside(beside: Beside | None, endpoint: str, argument: Callable[[str, str], object]) -> tuple[object, object]:
+    """Return the sequence of an endpoint, None if nothing is filled in its messages, and what is filled in them."""
+    filled = _filled(beside)
+    return argument("sequence", endpoint) if filled else None, filled
+
+
+def _filled(beside: Beside | None) -> tuple[tuple[int | float, ...], ...]:
+    """Return what is filled in messages when they are sent, as plain values."""
+    return tuple(each.members for each in beside.changing) if beside else ()
 
 
 def _settings(topic: TopicPlan) -> tuple[object, ...]:

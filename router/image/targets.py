@@ -9,7 +9,7 @@ from typing import Any
 
 from router import declared as c
 from router.compiler.checked import Target
-from router.compiler.compiled_table import STRANGER, CompiledTable, RoutePlan, source_label
+from router.compiler.compiled_table import STRANGER, Beside, CompiledTable, RoutePlan, source_label
 from router.compiler.lowering import LoweredCollect, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
@@ -41,6 +41,7 @@ class TargetWriter:
     boards: Mapping[str, ctypes._Pointer[c.Board]]
     timers: list[Timer] = field(default_factory=list)
     _topics: dict[str, c.Topic] = field(default_factory=dict)
+    _besides: dict[str, c.Beside] = field(default_factory=dict)
     _sources: Any = None
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[Target], lowered: LoweredRoute | None) -> c.Targets:
@@ -78,7 +79,11 @@ class TargetWriter:
             if target.declared.max_rate is not None and not written.period:
                 limits = {at: self.openings.limit(plan, target, source) for at, source in sources.items()}
                 written.limits = self._by_source(limits)
+            if target.beside is not None and target.beside.changing:
+                written.beside = ctypes.pointer(self._beside(target.label, target.beside))
+                written.is_ordered = True
             if target.deadmen:
+                written.is_ordered = True
                 feeds = [self._feed(plan, target, route) for route in target.deadmen]
                 written.feeds, written.feed_count = self.arrays.array(c.Feed, feeds), len(feeds)
         return self.arrays.add(together)
@@ -107,6 +112,13 @@ class TargetWriter:
         if endpoint in self.boards:
             written.board = self.boards[endpoint]
         return written
+
+    def _beside(self, endpoint: str, beside: Beside) -> c.Beside:
+        if endpoint not in self._besides:
+            fields = self.arrays.array(c.BesideField, [c.BesideField(*each.members) for each in beside.changing])
+            written = c.Beside(sequence=self.openings.sequence(endpoint), fields=fields, count=len(beside.changing))
+            self._besides[endpoint] = self.arrays.add(written)
+        return self._besides[endpoint]
 
     def _topic(self, topic: str) -> c.Target:
         if topic not in self._topics:

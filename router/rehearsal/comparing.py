@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from router.compiler import Checked
 from router.compiler.compiled_table import CompiledTable
+from router.compiler.expressions.tree import ENVELOPE
 from router.datagrams import Wire
 from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal import cdr
@@ -156,9 +157,14 @@ class Comparison:
             return
         if decoded.case.name != case:
             yield Failure(expected.span, f"{self.describer.describe(event)}, not {case}", self.describer.related(event))
-        elif expected.fields is not None:
-            now = outcome.given_at(event.at)
+            return
+        now, around = outcome.given_at(event.at), self._wire.envelope
+        if expected.fields is not None:
             for difference in expected.fields.differences((), decoded.case.type, decoded.message, now):
+                yield self._different_field(difference, event)
+        if expected.beside is not None:
+            whole = around.message_class.FromString(restored(event.data))
+            for difference in expected.beside.differences((ENVELOPE,), around.beside, whole, now):
                 yield self._different_field(difference, event)
 
     def _different_field(self, difference: Difference, event: Sent | Published) -> Failure:

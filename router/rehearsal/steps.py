@@ -6,12 +6,13 @@ Every name must be in the table under test; otherwise InvalidValueError is raise
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 from router.compiler import Checked
 from router.compiler.compiled_table import CompiledTable
+from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
@@ -57,7 +58,8 @@ class Given:
 class Delivery:
     """One expected delivery: the datagram as it was given, these bytes, or a message with these fields.
 
-    `case` is the payload of a datagram. If none of these is given, any content is accepted.
+    `case` is the payload of a datagram, `beside` has fields of its envelope. If none of these is given, any content is
+    accepted.
     """
 
     span: SourceSpan
@@ -65,6 +67,7 @@ class Delivery:
     data: bytes | None = None
     case: PayloadCase | None = None
     fields: Fields | None = None
+    beside: Fields | None = None
 
     @property
     def is_compared(self) -> bool:
@@ -140,6 +143,10 @@ class Names:
             message = f"{envelope.name} has no payload case '{name}'"
             raise InvalidValueError(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
         return envelope.cases[name]
+
+    @property
+    def cases(self) -> Collection[str]:
+        return self._program.envelope.cases
 
     @property
     def beside(self) -> MessageType:
@@ -354,18 +361,25 @@ class ExpectedReader:
             return [_of_word(node, given)]
         if not isinstance(node, MappingNode):
             raise InvalidValueError(node.span, Code.WRONG_TYPE, "a list within a list is not a datagram")
-        times = _times(node)
-        content = [(name, entry) for name, entry in node.entries.items() if name != "times"]
-        if not content:
+        times, around = _times(node), self._around(node)
+        content = [(name, entry) for name, entry in node.entries.items() if name != "times" and entry is not around]
+        beside = self._fields.message(self._names.beside, around.value) if around else None
+        if not content and around is None:
             return [_unchanged(node.span, given)] * times
-        return [self._datagram(name, entry, given) for name, entry in content] * times
+        if around is not None and (not content or "hex" in node.entries):
+            raise InvalidValueError(node.span, Code.MISSING_KEY, f"'{ENVELOPE}' needs a payload case beside it")
+        return [self._datagram(name, entry, given, beside) for name, entry in content] * times
 
-    def _datagram(self, name: str, entry: Entry, given: Node | None) -> Delivery:
+    def _around(self, node: MappingNode) -> Entry | None:
+        """Return the entry for fields beside the payload, unless it is a payload case of that name."""
+        return None if ENVELOPE in self._names.cases else node.entries.get(ENVELOPE)
+
+    def _datagram(self, name: str, entry: Entry, given: Node | None, beside: Fields | None) -> Delivery:
         if name == "hex":
             return Delivery(entry.key.span, data=_bytes(entry.value))
         case = self._names.case(name, entry.key.span)
         fields = None if _is(entry.value, ANY) else self._content(case.type, entry.value, given)
-        return Delivery(entry.key.span, case=case, fields=fields)
+        return Delivery(entry.key.span, case=case, fields=fields, beside=beside)
 
     def _published(self, node: Node | None, given: Node | None) -> Deliveries:
         deliveries: dict[str, tuple[Delivery, ...]] = {}

@@ -112,7 +112,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
         http=builder.one(root, "http", _server),
         listeners=builder.each(root, "listen", _named(Listener)),
-        endpoints=builder.each(root, "endpoints", _named(Endpoint)),
+        endpoints=builder.each(root, "endpoints", _endpoint),
         routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
         routes_span=routes.key.span if routes else None,
         gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, Gateway)},
@@ -235,6 +235,13 @@ def _scalar_value(key: Key, node: ScalarNode) -> object:
 def _named(model: type[M]) -> Callable[[Entry], M]:
     """Return a reader for parts under a name that the table chooses."""
     return lambda entry: structure(model, mapping(entry.value), name=entry.key.text, span=entry.key.span)
+
+
+def _endpoint(entry: Entry) -> Endpoint:
+    settings = mapping(entry.value)
+    beside = settings.entries.get("set")
+    given = {"name": entry.key.text, "span": entry.key.span}
+    return structure(Endpoint, settings, **given, beside=_constants(beside) if beside else None)
 
 
 def _envelope(entry: Entry) -> EnvelopeSettings:

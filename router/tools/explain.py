@@ -14,6 +14,7 @@ from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, Target
 from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan
+from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
@@ -237,8 +238,11 @@ def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
 
 def _mapping(served: Target) -> Iterator[str]:
     """Yield one line for each mapped field, in columns, and the fields that nothing fills."""
-    yield from _rows(served.rows)
-    if served.plan is not None and (unset := list(_unset(served.plan, ""))):
+    beside = served.beside
+    yield from _rows([*served.rows, *(beside.rows if beside else ())])
+    unset = [*_unset(served.plan, "")] if served.plan is not None else []
+    unset += _unset(beside.plan, ENVELOPE) if beside else ()
+    if unset:
         yield f"    left at their defaults: {', '.join(unset)}"
 
 

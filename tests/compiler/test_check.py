@@ -89,6 +89,22 @@ def test_fields_beside_the_payload_are_empty_in_what_the_router_makes(
         assert [each.code for each in check_table(table, {}).diagnostics] == [code] * is_found
 
 
+def test_set_fills_what_the_envelope_requires_for_its_endpoint_only(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    drive = f"{{{SPEED}, destinations: [board, base], deadman: {{none: it is a test}}}}"
+    text = BESIDE.format(protos=HERE / "protos" / "must", because="", drive=drive)
+    ends = ("kind: board", "kind: basestation")
+    for filled, lacking in ((ends, []), (ends[:1], ["'base'"]), (ends[1:], ["'board'"])):
+        written = text
+        for end in filled:
+            written = written.replace(end, f"{end}, set: {{sequence: 7}}")
+        table.write_text(written)
+        found = check_table(table, {}).diagnostics
+        assert [(each.code, each.message.rpartition(" ")[2]) for each in found] == [
+            (Code.MISSING_KEY, name) for name in lacking
+        ]
+
+
 def plain(value: Any) -> Any:
     """What a part of a program consists of: the order of a set alone does not count."""
     if isinstance(value, (set, frozenset)):

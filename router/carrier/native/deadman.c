@@ -91,6 +91,7 @@ static void note_brake(struct timers *timers, const struct deadman *deadman, con
 static int send_to(struct timers *timers, struct deadman *deadman, const struct deadman_destination *to) {
     int failed = 0;
     for (uint32_t index = 0; index < to->count; index++) {
+        if (to->beside.count) beside_fill(&to->beside, to->datagrams[index].data, timers->env->wall(timers->env));
         int error = timers->env->brake(timers->env, to, &to->datagrams[index]);
         if (error) failed = error;
         if (error == BRAKE_LATER) continue;
@@ -463,6 +464,7 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
                              uint32_t trips, uint32_t id, const struct deadman_destination *destinations,
                              uint32_t count) {
     size_t datagrams = 0, bytes = 0;
+    for (uint32_t index = 0; index < count; index++) bytes += destinations[index].beside.count * sizeof(struct beside_field);
     for (uint32_t index = 0; index < count; index++)
         for (uint32_t each = 0; each < destinations[index].count; each++, datagrams++)
             bytes += destinations[index].datagrams[each].size;
@@ -482,10 +484,16 @@ struct deadman *deadman_open(struct timers *timers, int64_t timeout, int64_t rep
     deadman->answers = (struct answer *)&deadman->destinations[count];
     deadman->heard_at = (int64_t *)&deadman->answers[count];
     struct deadman_datagram *copy = (struct deadman_datagram *)&deadman->heard_at[count];
-    uint8_t *data = (uint8_t *)(copy + datagrams);
+    struct beside_field *fields = (struct beside_field *)(copy + datagrams);
+    for (uint32_t index = 0; index < count; index++) {
+        const struct beside *beside = &destinations[index].beside;
+        deadman->destinations[index] = destinations[index];
+        deadman->destinations[index].beside.fields = fields;
+        for (uint32_t each = 0; each < beside->count; each++) *fields++ = beside->fields[each];
+    }
+    uint8_t *data = (uint8_t *)fields;
     for (uint32_t index = 0; index < count; index++) {
         const struct deadman_destination *from = &destinations[index];
-        deadman->destinations[index] = *from;
         deadman->destinations[index].datagrams = copy;
         for (uint32_t each = 0; each < from->count; each++, copy++) {
             *copy = (struct deadman_datagram){memcpy(data, from->datagrams[each].data, from->datagrams[each].size),

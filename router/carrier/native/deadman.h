@@ -26,6 +26,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "beside.h"
 #include "counters.h"
 #include "events.h"
 #include "ring.h"
@@ -41,8 +42,9 @@ enum { MOST_DESTINATIONS = 64 }; /* of a deadman */
 
 struct deadman_destination {
     struct sender *sender;
-    /* Sent in this order. `deadman_open` copies them, and the list of destinations. */
+    /* Sent in this order. `deadman_open` copies them, what is filled when they are sent, and the list of destinations. */
     const struct deadman_datagram *datagrams;
+    struct beside beside;
     uint32_t count;
     uint32_t sent, send_errors; /* counters */
     uint32_t id;                /* of its name: in events, and the same in the next program */

@@ -249,10 +249,24 @@ static int64_t clock_now(struct thread_env *env) {
     return boottime_ns();
 }
 
+static int64_t clock_wall(struct thread_env *env) {
+    (void)env;
+    return wall_ns();
+}
+
+/* The environment of the group fills the message and sends it. */
+static int send_filled(struct timers *timers, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
+    pthread_mutex_lock(&timers->lock);
+    int error = timers->env->send(timers->env, target, data, size, expires);
+    pthread_mutex_unlock(&timers->lock);
+    return error;
+}
+
 /* `deliver` has checked the age; it is checked again only after waiting for the lock of deadmen. */
 static int send_by_socket(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size,
                           int64_t expires) {
-    if (!target->feed_count) return sender_send(target->sender, data, size);
+    if (!target->is_ordered) return sender_send(target->sender, data, size);
+    if (target->beside) return send_filled(env->timers, target, data, size, expires);
     return command_send(env->timers, target->sender, data, size, expires, target->feeds, target->feed_count);
 }
 
@@ -268,6 +282,7 @@ bool env_open(struct thread_env *env, counter *counters, struct ring *events, st
     env->reporter.events = events;
     env->timers = timers;
     env->now = clock_now;
+    env->wall = clock_wall;
     env->send = send_by_socket;
     env->brake = brake_by_socket;
     return machine_open(&env->machine);

@@ -20,6 +20,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "beside.h"
 #include "board.h"
 #include "counters.h"
 #include "deadman.h"
@@ -68,6 +69,8 @@ struct target {
     const struct board *board; /* NULL if it is not a board */
     const struct feed *feeds;  /* the deadmen that a command feeds or disarms */
     uint32_t feed_count;
+    uint32_t is_ordered; /* 1: its messages are sent with the lock of the timers held, as they have feeds or `beside` */
+    const struct beside *beside; /* what is filled when a message is sent; NULL without */
     uint32_t trims; /* whether it gets datagrams without their trailing zeros */
     uint32_t priority; /* of its messages under a bandwidth: enum priority in pace.h */
     uint32_t id;    /* in events */
@@ -132,8 +135,9 @@ struct thread_env {
     struct timers *timers; /* the group of the deadmen that its commands feed */
     /* Called for each increment by a message or a deadman; NULL in operation. */
     void (*counted)(struct thread_env *env, uint32_t index, int64_t amount);
-    /* The boot clock, ns. */
+    /* The boot clock and the wall clock, ns. */
     int64_t (*now)(struct thread_env *env);
+    int64_t (*wall)(struct thread_env *env);
     /* Send as `command_send` does. The caller has just checked the age. */
     int (*send)(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
     /* Send a datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */

@@ -70,9 +70,12 @@ static void counted(struct thread_env *env, uint32_t index, int64_t amount) {
 
 static int64_t simulated_now(struct thread_env *env) { return env->simulation->now; }
 
+static int64_t simulated_wall(struct thread_env *env) { return env->simulation->now + env->simulation->ahead; }
+
 static int send_nowhere(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
     int64_t now = env->simulation->now;
     if (now > expires) return COMMAND_STALE;
+    if (target->beside) beside_fill(target->beside, data, env->wall(env));
     note_output(env, RECORD_SENT, target->id, data, size);
     if (target->feed_count) command_has_left(env->simulation->timers, target->feeds, target->feed_count, 0, now);
     return 0;
@@ -97,6 +100,7 @@ static bool open_env(struct simulation *simulation, struct thread_env *env, coun
     env->simulation = simulation;
     env->counted = counted;
     env->now = simulated_now;
+    env->wall = simulated_wall;
     env->send = send_nowhere;
     env->brake = brake_nowhere;
     env->publish = publish_nowhere;

@@ -35,6 +35,7 @@ struct timers *timers_open_on(struct thread_env *env, bool has_timer) {
 /* Send a command while the lock is held. */
 static int send_locked(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
     int64_t now = env->now(env);
+    if (target->beside) beside_fill(target->beside, data, env->wall(env));
     return command_send_at(env->timers, target->sender, data, size, expires, target->feeds, target->feed_count, now);
 }
 

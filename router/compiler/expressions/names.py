@@ -114,7 +114,7 @@ def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) 
         span,
         Code.UNKNOWN_FIELD,
         message,
-        hint or f"write a constant such as {example}: a deadman has no message to read",
+        hint or f"write a constant such as {example}: there is no message to read",
     )
 
 

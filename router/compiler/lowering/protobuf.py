@@ -24,12 +24,18 @@ from router.types.wire import GROUP, GROUP_END, LEN, encoding_of, varint
 _CLOSE = Operation(Op.CLOSE)
 
 
-def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase) -> list[Placed]:
-    """Return the operations that write the envelope of a payload, each with its place."""
+def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b"") -> list[Placed]:
+    """Return the operations that write an envelope, each with its place: the bytes `beside`, and the payload."""
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
     place = Place(plan.span, "")
     inside = _Writer(lowering).record(plan, descriptor, "")
-    return list(merged(_delimited(case.number << 3 | LEN, inside, place)))
+    before = at(place, known(beside)) if beside else []
+    return list(merged([*before, *_delimited(case.number << 3 | LEN, inside, place)]))
+
+
+def protobuf_fields(lowering: Lowering, plan: Record, descriptor: Descriptor) -> list[Placed]:
+    """Return the operations that write the fields of a message, each with its place."""
+    return list(merged(_Writer(lowering).record(plan, descriptor, "")))
 
 
 @dataclass(frozen=True, slots=True)

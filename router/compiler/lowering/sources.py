@@ -25,7 +25,7 @@ from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
 from router.compiler.lowering.numbers import signs
 from router.compiler.lowering.operations import Operation, Routine, Slot, chained, depths, most_executed, nesting
-from router.compiler.lowering.protobuf import protobuf_message
+from router.compiler.lowering.protobuf import protobuf_fields, protobuf_message
 from router.compiler.lowering.sections import Section
 from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
@@ -155,7 +155,8 @@ class RosMessage(_Source):
             lowering = self.lowering()
             condition, when = self.condition(lowering, [feed.when, target.when])
             assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
-            message, places = self.sent(lowering, target.plan, checked.case)
+            beside = target.beside.data if target.beside else b""
+            message, places = self.sent(lowering, target.plan, checked.case, beside)
             all_places = f"{feed.topic.span}: a malformed message", when, place, *places
             targets[target.label] = replace(target, condition=condition, message=message, places=all_places)
         layout = self.layout(feed.topic.span)
@@ -168,9 +169,11 @@ class RosMessage(_Source):
             self._elements(elements, targets.values()) if elements else None,
         )
 
-    def sent(self, lowering: Lowering, plan: Record, case: PayloadCase) -> tuple[Routine, tuple[str, ...]]:
-        """Lower the envelope for a destination, with the place of each operation."""
-        return _with_places(protobuf_message(lowering, plan, case))
+    def sent(
+        self, lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b""
+    ) -> tuple[Routine, tuple[str, ...]]:
+        """Lower the envelope for a destination, with the place of each operation. `beside` precedes the payload."""
+        return _with_places(protobuf_message(lowering, plan, case, beside))
 
     def _stamp(self, node: tree.Node) -> tuple[Slot, Slot]:
         """Return the slots of the seconds and nanoseconds of a field with a time."""
@@ -204,15 +207,24 @@ class RosMessage(_Source):
 
 
 class Constants(_Source):
-    """No message: a deadman sends constants."""
+    """No message: deadmen, and `set` of endpoints, have constants."""
 
     def __init__(self) -> None:
         super().__init__(Section(MessageType("nothing"), None))
 
-    def lowered(self, plan: Record, case: PayloadCase | None) -> LoweredConstant:
-        """Lower the envelope of a payload, or a ROS message if `case` is None. Raises TooLargeError."""
-        lowering = self.lowering()
-        placed = protobuf_message(lowering, plan, case) if case is not None else cdr_message(lowering, plan)
+    def envelope(self, plan: Record, case: PayloadCase) -> LoweredConstant:
+        """Lower the envelope of a payload. Raises TooLargeError, as do the others."""
+        return self._lowered(plan, protobuf_message(self.lowering(), plan, case))
+
+    def fields(self, plan: Record, descriptor: Descriptor) -> LoweredConstant:
+        """Lower the fields of a protobuf message."""
+        return self._lowered(plan, protobuf_fields(self.lowering(), plan, descriptor))
+
+    def cdr(self, plan: Record) -> LoweredConstant:
+        """Lower a ROS message."""
+        return self._lowered(plan, cdr_message(self.lowering(), plan))
+
+    def _lowered(self, plan: Record, placed: Sequence[Placed]) -> LoweredConstant:
         _require_small([(operation, place.span) for operation, place in placed])
         layout = _small(cdr_layout(self.temporaries, self.root, self.elements, plan.span), plan.span)
         return LoweredConstant(tuple(operation for operation, _ in placed), layout, tuple(place for _, place in placed))

@@ -180,6 +180,12 @@ VALUES: Schema = {
         {"type": "object", **_FIELDS},
         must="be a mapping of its fields to constants, or {} for their defaults",
     ),
+    "beside": {
+        "type": "object",
+        "minProperties": 1,
+        **_FIELDS,
+        "errorMessage": "must be a mapping of the envelope's fields, such as {seq: sequence, robot: 3}",
+    },
     "payloads": {
         "type": "object",
         "minProperties": 1,

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from router.errors import Located, SourceSpan
 from router.table.addresses import LOCAL, REMOTE, Address
-from router.table.keys import Range, Shape
+from router.table.keys import Named, Range, Shape
+from router.table.model.expressions import FieldMap
 from router.table.units import DATA_RATE, PATIENCE, SIZE
 
 
@@ -128,4 +129,11 @@ class Endpoint:
     Only for kind: board; other endpoints always get them.
 
     Title: Allow NaN and infinity
+    """
+    beside: Annotated[FieldMap | None, Named("set"), Shape("beside")] = None
+    """Fields of the envelope beside the payload, in every message that the router makes for the endpoint: from ROS, and
+    for deadman timers. Each is a constant, `sequence`, which counts these messages from 1, or `now`, the time of
+    sending, which as a number is in seconds, as in `now * 1000`. Forwarded messages keep their own.
+
+    Example: {seq: sequence, sent_at: now, robot: 3}
     """

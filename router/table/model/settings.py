@@ -51,8 +51,8 @@ class EnvelopeSettings:
     Example: [motor/old.proto, tests]
     """
     because: Annotated[str | None, Shape("reason")] = None
-    """Why boards accept envelopes whose fields beside the payload are empty. The router fills none in those that it
-    makes from ROS messages and for deadman timers; forwarded ones keep theirs.
+    """Why boards accept envelopes whose fields beside the payload are empty. In envelopes that the router makes from
+    ROS messages and for deadman timers, it fills only what 'set' of the endpoint has; forwarded ones keep theirs.
 
     Example: boards do not check the sequence number
     Error: must be a text that says why these fields may be empty

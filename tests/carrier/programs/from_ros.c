@@ -12,7 +12,8 @@
 
 enum { MESSAGES = 2000, RECEIVED = 0, LAST, SENT, BYTES, LOST, DURATION, COUNTERS = 64 };
 
-static const uint8_t MESSAGE[] = {0, 1, 0, 0, 7, 0, 0, 0};
+static const uint8_t MESSAGE[] = {0, 1, 0, 0, 0, 0, 1, 0}; /* 65536, a varint of three bytes */
+static const struct beside_field NUMBER = {.offset = 1, .size = 3, .encoding = BESIDE_VARINT, .value = BESIDE_NUMBER, .bits = 21};
 static const struct read_operation STEPS[] = {{.kind = READ_SCALAR, .type = SCALAR_UINT32, .slot = 2}};
 static const struct section NODE = {.steps = STEPS, .count = 1};
 static const struct value DEFAULTS[3];
@@ -34,9 +35,14 @@ static void *publish(void *of) {
     return NULL;
 }
 
+/* Commands and brakes leave in the order of their numbers. */
 static void *drain(void *of) {
-    char datagram[64];
-    while (recv(*(int *)of, datagram, sizeof datagram, 0) > 0) {}
+    uint8_t datagram[64];
+    for (int last = 0; recv(*(int *)of, datagram, sizeof datagram, 0) > 0;) {
+        int number = (datagram[1] & 0x7F) | (datagram[2] & 0x7F) << 7 | datagram[3] << 14;
+        assert(number > last);
+        last = number;
+    }
     return NULL;
 }
 
@@ -51,12 +57,14 @@ int main(void) {
     struct sender *sender = sender_open(pair[0], -1, 0, 0);
     struct ring *events = ring_open(1 << 12);
     struct timers *timers = timers_open(braked, NULL);
-    struct deadman_datagram brake = {MESSAGE, 1};
-    struct deadman_destination braking = {.sender = sender, .datagrams = &brake, .count = 1, .sent = 2, .send_errors = 3};
+    struct beside beside = {sequence_open(), &NUMBER, 1, 0};
+    struct deadman_datagram brake = {MESSAGE, 4};
+    struct deadman_destination braking = {.sender = sender, .datagrams = &brake, .beside = beside, .count = 1, .sent = 2,
+                                          .send_errors = 3};
     struct deadman *deadman = deadman_open(timers, 1000, 1000000, true, 0, 1, 0, &braking, 1);
     struct feed feed = {.deadman = deadman, .to = 1};
     struct target target = {.message = {OPERATIONS, 2, 0}, .sender = sender, .feeds = &feed, .feed_count = 1,
-                            .delivered = SENT, .delivered_bytes = BYTES};
+                            .is_ordered = 1, .beside = &beside, .delivered = SENT, .delivered_bytes = BYTES};
     for (int reason = 0; reason < DROP_REASONS; reason++) target.dropped[reason] = LOST;
     struct ros_route route = {
         .targets = {.ttl = 1000000000, .layout = &LAYOUT, .targets = &target, .count = 1, .topic = NO_NAME},
@@ -90,6 +98,7 @@ int main(void) {
     shutdown(pair[0], SHUT_RDWR);
     pthread_join(draining, NULL);
     deadman_close(timers, deadman);
+    sequence_close(beside.sequence);
     timers_close(timers);
     sender_close(sender);
     ring_close(events);

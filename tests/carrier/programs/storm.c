@@ -125,7 +125,7 @@ static struct listener make_listener(const struct made *made, int index) {
 static struct target make_destination(const struct made *made, int route, int to) {
     struct target target = {
         .sender = senders[to], .limits = to == 1 ? limits : NULL, .feeds = &made->feed, .feed_count = to == 0,
-        .condition = {&made->condition, to == 1, 0}, .trims = to == 1, .id = (uint32_t)to,
+        .is_ordered = to == 0, .condition = {&made->condition, to == 1, 0}, .trims = to == 1, .id = (uint32_t)to,
         .delivered = destination_counter(route, to, SENT), .delivered_bytes = destination_counter(route, to, SENT_BYTES)};
     target.dropped[DROP_STALE] = destination_counter(route, to, STALE);
     target.dropped[DROP_RATE_LIMITED] = destination_counter(route, to, LIMITED);
