@@ -33,6 +33,7 @@ TABLE = (
     Section("Defaults", "defaults", "definitions.defaults"),
     Section("Listeners", "listen.NAME", "definitions.listener"),
     Section("Endpoints", "endpoints.NAME", "definitions.endpoint"),
+    Section("States", "state.NAME", "definitions.state"),
     Section("Routes", "routes.CASE", "definitions.route"),
     Section("Source topics", "routes.CASE.source", "definitions.source_topic"),
     Section("Destinations", "routes.CASE.destinations", "definitions.destination.then"),
@@ -214,7 +215,7 @@ class SchemaPage:
         yield "", ["version", *complete["complete"]["else"]["required"]]
         for key in ("envelope", "http", "record", "foxglove"):
             yield f"properties.{key}", rules[key]["required"]
-        for key, definition in (("listen", "listener"), ("endpoints", "endpoint")):
+        for key, definition in (("listen", "listener"), ("endpoints", "endpoint"), ("state", "state")):
             yield f"definitions.{definition}", rules[key]["additionalProperties"]["required"]
         route, gateway = complete["complete_route"]["else"], complete["complete_gateway"]["else"]
         yield "definitions.route", route["required"]

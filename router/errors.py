@@ -118,6 +118,8 @@ class Code(enum.Enum):
         "empty-field",
         "A field of the envelope, beside the payload, that nothing fills where the router makes envelopes for boards.",
     )
+    UNKNOWN_STATE = ("unknown-state", "A condition reads a state that is not in `state`.")
+    NEVER_SET = ("never-set", "A state that no message can set, because no route takes its messages.")
     NO_TARGET = ("no-target", "A route without destinations or topics.")
     SOURCE_CLASH = ("source-clash", "Two routes of one payload case have the same source.")
     NO_DEADMAN = ("no-deadman", "Nothing stops the board when its commands stop arriving.")

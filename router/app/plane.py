@@ -17,7 +17,7 @@ from time import monotonic, sleep
 from router.app.change import Change
 from router.app.counts import ThreadCounts
 from router.carrier.client_deadmen import ClientDeadmen, await_receipt
-from router.carrier.events import DeadmanEvents, EventReader, EventThread
+from router.carrier.events import DeadmanEvents, EventReader, EventThread, StateChange
 from router.carrier.forwarding import FIRST_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.loading import LoadedImage
@@ -125,7 +125,9 @@ class Plane:
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
         self._acted = ActionRing(forwarding.acted, self._names)
         reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
-        self._events = EventThread(threads, reader, reporter.report, of_deadmen, reporter.returned, self._pulse)
+        self._events = EventThread(
+            threads, reader, reporter.report, of_deadmen, reporter.returned, self._state_changed, self._pulse
+        )
 
     @property
     def image(self) -> LoadedImage | None:
@@ -324,6 +326,16 @@ class Plane:
     def _superseded(self, listener: str, data: bytes) -> str:
         newest = next(reversed(self._programs.values()), None)
         return superseded(newest, listener, data) if newest is not None else ""
+
+    def _state_changed(self, change: StateChange) -> None:
+        """Log a change in the words of the newest table that has the state."""
+        programs = reversed(self._programs.values())
+        plan = next((state for each in programs for state in each.states if state.name == change.state), None)
+        before, after = (plan.shown(value) if plan else str(value) for value in (change.before, change.after))
+        if change.source is not None:
+            logger.info("state changed", state=change.state, before=before, after=after, source=change.source)
+        else:
+            logger.warning("state is back at its initial value", state=change.state, before=before, after=after)
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" if an earlier program refused the message."""

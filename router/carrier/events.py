@@ -23,6 +23,7 @@ from router.declared import (
     LostEvent,
     Reason,
     ReturnedEvent,
+    StateEvent,
 )
 from router.image.names import Names
 from router.threads import Thread, join_or_abandon
@@ -45,6 +46,16 @@ class Returned:
 
     endpoint: str
     silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class StateChange:
+    """The value of a state has changed. `source` has set it; None if it has expired, or by a reload."""
+
+    state: str
+    before: int
+    after: int
+    source: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +89,7 @@ class EventReader:
         self._superseded = superseded
         self._place = place
 
-    def read(self, kind: int, record: memoryview) -> DeadmanEvents | Returned | CountedReport:
+    def read(self, kind: int, record: memoryview) -> DeadmanEvents | StateChange | Returned | CountedReport:
         if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
             return self._of_datagram(record)
         if kind == EventKind.LOST:
@@ -88,6 +99,10 @@ class EventReader:
         if kind == EventKind.RETURNED:
             returned = ReturnedEvent.from_buffer(record)
             return Returned(self._name(returned.endpoint), returned.silence / 1e9)
+        if kind == EventKind.STATE:
+            changed = StateEvent.from_buffer(record)
+            source = self._name(changed.source) if changed.source != NO_NAME else None
+            return StateChange(self._name(changed.state), changed.before, changed.after, source)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -137,8 +152,8 @@ class EventThread:
     """Reads the events of native threads, and calls `pulse` every few seconds to signal that Python is alive.
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
-    that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s), `of_deadmen`
-    everything else.
+    that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s),
+    `state_changed` a state that has changed, `of_deadmen` everything else.
     """
 
     def __init__(
@@ -148,6 +163,7 @@ class EventThread:
         report: Callable[[Report], None],
         of_deadmen: Callable[[DeadmanEvents], None],
         returned: Callable[[str, float], None],
+        state_changed: Callable[[StateChange], None],
         pulse: Callable[[], None],
     ) -> None:
         self._threads = threads
@@ -155,6 +171,7 @@ class EventThread:
         self._report = report
         self._of_deadmen = of_deadmen
         self._returned = returned
+        self._state_changed = state_changed
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
@@ -201,6 +218,8 @@ class EventThread:
         match self._reader.read(kind, record):
             case Returned(endpoint, silence):
                 self._returned(endpoint, silence)
+            case StateChange() as change:
+                self._state_changed(change)
             case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
             case of_deadman:

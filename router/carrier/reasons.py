@@ -30,5 +30,8 @@ def superseded(program: CompiledTable, listener: str, data: bytes) -> str:
 def where_refused(program: CompiledTable, route: str, topic: str | None, target: str, place: int) -> str:
     """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
     (plan,) = (plan for plan in program.routes if (plan.route, plan.topic) == (route, topic))
+    for state in program.states:
+        if target == state.label:
+            return state.place
     by_label = {to.label: to for to in plan.targets if to.places}  # a topic rather than an endpoint of the same name
     return by_label[target].places[place]

@@ -9,7 +9,7 @@ from typing import NamedTuple, Union
 from weakref import finalize
 
 from router import declared as c
-from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned
+from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned, StateChange
 from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.compiler.compiled_table import CompiledTable
@@ -41,7 +41,7 @@ class Output(NamedTuple):
     data: bytes
 
 
-Record = Union[Time, Increment, Output, DeadmanEvents, Returned, CountedReport]
+Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Returned, CountedReport]
 
 
 class Simulation:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from router.compiler.beside import check_beside, unfilled
 from router.compiler.brakes import brake_findings
-from router.compiler.checked import CheckedRoute
+from router.compiler.checked import CheckedRoute, CheckedState
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
@@ -22,6 +22,7 @@ from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.routes import check_routes, clash_findings
+from router.compiler.states import check_states, condition_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Code, Diagnostic, Severity, TableError
 from router.table import in_order, load_table
@@ -59,6 +60,7 @@ class Checked:
     gateways: Sequence[GatewayPlan] = ()
     boards: Mapping[str, BoardLimits] = field(default_factory=dict)
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
+    states: Mapping[str, CheckedState] = field(default_factory=dict)
     lowered: Lowered | None = None
 
     @property
@@ -104,6 +106,7 @@ def check_table(
     boards = _boards(table, schema, envelope, board_limit)
     lookup = Lookup(table, schema, envelope, definitions, board_limit, boards)
     lookup.beside = check_beside(lookup)
+    states = check_states(lookup)
     routes = check_routes(lookup)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
@@ -116,6 +119,7 @@ def check_table(
         *_board_findings(table, boards),
         *_envelope_findings(lookup, routes),
         *lookup.findings,
+        *condition_findings(lookup, routes),
         *clash_findings(table),
         *brake_findings(table, routes),
         *topic_findings(table, [checked.route for checked in routes]),
@@ -123,11 +127,13 @@ def check_table(
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
     if not _has_errors(findings):
-        lowered, limits = lower_table(routes, envelope)
+        lowered, limits = lower_table(routes, envelope, states)
         findings += limits
         lowered = None if limits else lowered
     schema.sources.close()
-    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, lowered)
+    return Checked(
+        path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, states, lowered
+    )
 
 
 def _has_errors(findings: Iterable[Diagnostic]) -> bool:

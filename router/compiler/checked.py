@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.compiler.compiled_table import Beside, DeadmanPlan, ObeyedPlan
+from router.compiler.expressions.kinds import Kind
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.errors import SourceSpan
 from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.routes import Route
+from router.table.model.state import State
 from router.table.model.targets import Destination, OnLimit, Priority, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
@@ -29,9 +31,10 @@ class Target:
     target feeds (its own route's) or disarms. `beside` is what `set` of the endpoint fills in messages with a plan.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
-    without a `when`, or without a `plan`. `places` are the places of the table where a message may be rejected, by
-    `enum place` in `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are already
-    checked), the condition, `for_each` or `collect`, and the field of each operation of `message`.
+    without a `when`, or without a `plan`. `gate` is the part of the condition that reads only states, if messages may
+    be held: they must still meet it when they leave. `places` are the places of the table where a message may be
+    rejected, by `enum place` in `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are
+    already checked), the condition, `for_each` or `collect`, and the field of each operation of `message`.
     """
 
     declared: Destination | Topic
@@ -44,6 +47,7 @@ class Target:
     deadmen: tuple[str, ...] = ()
     beside: Beside | None = None
     condition: Routine = ()
+    gate: Routine = ()
     message: Routine = ()
     places: tuple[str, ...] = ()
 
@@ -80,6 +84,20 @@ class Target:
         """Whether its messages may be deferred and then sent by another thread: see `on_limit` and `bandwidth`."""
         has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedState:
+    """A state, with the value that a message of `case` gives it. Values are integers, also of bools and enums."""
+
+    declared: State
+    case: PayloadCase
+    value: Node
+    initial: int
+
+    @property
+    def kind(self) -> Kind:
+        return self.value.kind
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from router.compiler.expressions.kinds import BoolKind, EnumKind
+from router.compiler.expressions.tree import STATE
 from router.compiler.metrics import Counters
 from router.declared import BesideEncoding, BesideValue
 from router.table.model import RouteTable
@@ -18,6 +20,7 @@ from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
 if TYPE_CHECKING:
     from router.compiler.checked import Target
+    from router.compiler.expressions.kinds import Kind
     from router.compiler.expressions.tree import Node
     from router.compiler.lowering import Lowered
     from router.compiler.mapping import Row
@@ -144,6 +147,47 @@ class DeadmanPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class StatePlan:
+    """A state: an integer, also for a bool or an enum. `valid_for` is in ns, None for never.
+
+    `setters` are the routes whose messages set it, each with the senders that do. `place` computes the value.
+    """
+
+    name: str
+    kind: Kind
+    initial: int
+    valid_for: int | None
+    setters: Mapping[str, Collection[str]]
+    place: str
+
+    @property
+    def label(self) -> str:
+        """The name in expressions, in the log, and as the target of messages without a value."""
+        return f"{STATE}.{self.name}"
+
+    @property
+    def type(self) -> str:
+        """The type with all its values: a reload keeps the state as long as it stays the same."""
+        values = self.kind.enum.values if isinstance(self.kind, EnumKind) else ()
+        return " ".join([str(self.kind), *(f"{name}={number}" for name, number in values)])
+
+    @property
+    def values(self) -> Collection[str] | None:
+        """All values as a table writes them; None for an integer."""
+        if isinstance(self.kind, EnumKind):
+            return [name for name, _ in self.kind.enum.values]
+        return ("true", "false") if isinstance(self.kind, BoolKind) else None
+
+    def shown(self, value: int) -> str:
+        """Return a value as a table writes it."""
+        if isinstance(self.kind, EnumKind):
+            return next((name for name, number in self.kind.enum.values if number == value), str(value))
+        if isinstance(self.kind, BoolKind):
+            return "true" if value else "false"
+        return str(value)
+
+
+@dataclass(frozen=True, slots=True)
 class InboundPlan:
     """A topic that a gateway's clients may publish on; `label` is its absolute name, which clients use.
 
@@ -209,6 +253,7 @@ class CompiledTable:
     lowered: Lowered
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
+    states: tuple[StatePlan, ...] = ()
 
     @property
     def listeners(self) -> tuple[Listener, ...]:

@@ -5,11 +5,11 @@ Expects a table without errors and checks nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
-from router.compiler.compiled_table import STRANGER, CompiledTable, GatewayPlan, RoutePlan, TopicPlan
+from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
+from router.compiler.compiled_table import STRANGER, CompiledTable, GatewayPlan, RoutePlan, StatePlan, TopicPlan
 from router.compiler.lookup import definitions_of
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
@@ -57,9 +57,24 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         lowered=lowered,
         boards=checked.boards,
         gateways=tuple(checked.gateways),
+        states=tuple(_state(state, lowered, inbound) for state in checked.states.values()),
     )
     open_series(program)
     return program
+
+
+def _state(state: CheckedState, lowered: Lowered, inbound: Mapping[int, Iterable[RoutePlan]]) -> StatePlan:
+    declared = state.declared
+    names = {source.value for source in declared.sources}
+    taken = {plan.route: names & plan.sources for plan in inbound.get(state.case.number, ())}
+    return StatePlan(
+        declared.name,
+        state.kind,
+        state.initial,
+        (declared.valid_for.value or None) if declared.valid_for else None,
+        {route: sources for route, sources in taken.items() if sources},
+        lowered.states[declared.name].place,
+    )
 
 
 def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:

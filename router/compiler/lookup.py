@@ -14,6 +14,7 @@ from router.compiler.compiled_table import Beside
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.expressions.operators import presence_hint
+from router.compiler.expressions.scope import BrokenStateError
 from router.compiler.expressions.tree import Node
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, one_of
@@ -74,7 +75,7 @@ class Lookup:
     """Looks up the names of one table and collects findings.
 
     `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint, `beside` what `set` of
-    an endpoint fills.
+    an endpoint fills, `states` the kind of each state, None for one with a finding.
     """
 
     table: RouteTable
@@ -85,6 +86,7 @@ class Lookup:
     boards: Mapping[str, BoardLimits]
     findings: list[Diagnostic] = field(default_factory=list)
     beside: Mapping[str, Beside] = field(default_factory=dict)
+    states: dict[str, Kind | None] = field(default_factory=dict)
 
     def report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
         self.findings.append(Diagnostic(span, code, message, hint))
@@ -181,7 +183,7 @@ class Lookup:
     ) -> Scope:
         """Return the scope of expressions over `message`, with the constants of `ros_type` and of the types in it."""
         nested = tuple(nested_types(ros_type)) if ros_type else ()
-        return Scope(message, tuple(self.schema.enums.values()), nested, names)
+        return Scope(message, tuple(self.schema.enums.values()), nested, names, states=self.states)
 
     def received(
         self,
@@ -196,14 +198,25 @@ class Lookup:
         return replace(self.scope(case.type, ros_type, names), envelope=self.envelope, sources=known)
 
     def value(
-        self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
+        self,
+        expression: Expression,
+        scope: Scope,
+        kinds: tuple[type[Kind], ...],
+        wanted: str,
+        hint: str = "",
+        expected: Type | None = None,
     ) -> Node | None:
-        """Check that an expression is of one of `kinds`. If not, return None and report `wanted`."""
+        """Check that an expression is of one of `kinds`. If not, return None and report `wanted`.
+
+        `expected` is as in `expressions.check`.
+        """
         try:
-            node = check(expression, scope)
+            node = check(expression, scope, expected)
             if not isinstance(node.kind, kinds):
                 hint = (presence_hint(node) if BoolKind in kinds else "") or hint
                 raise ExpressionError(node.span, Code.TYPE_MISMATCH, f"{wanted}, not {node.kind}", hint)
+        except BrokenStateError:
+            return None
         except ExpressionError as error:
             self.findings.append(error.diagnostic)
             return None
@@ -213,7 +226,7 @@ class Lookup:
         if expression is None:
             return None
         hint = "write a comparison, such as fix_quality != GPSFixQuality.NO_FIX"
-        return self.value(expression, scope, (BoolKind,), "'when' takes a bool", hint)
+        return self.value(expression, replace(scope, reads_states=True), (BoolKind,), "'when' takes a bool", hint)
 
 
 def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str:

@@ -144,6 +144,14 @@ METRICS = (
         "Time from the first brake until the endpoint showed that it had stopped.",
         bounds=STOPPING_BOUNDS_NS,
     ),
+    Metric("state", "level", ("state",), "The value of a state: an integer, also of a bool or an enum."),
+    Metric("state_changes", "counter", ("state",), "How often the value of a state changed, also by expiring."),
+    Metric(
+        "state_set_seconds",
+        "age",
+        ("state", "source"),
+        "How long ago a message of the source that set the state arrived; no series until one has.",
+    ),
     Metric("gateway_clients", "number", ("route",), "Current clients of a gateway."),
     Metric(
         "gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of the router's."

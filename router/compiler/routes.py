@@ -16,6 +16,7 @@ from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.obeyed import check_obeyed
+from router.compiler.states import sets_state
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
@@ -96,7 +97,8 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
     if route.ignore is not None:
         return CheckedRoute(route, case)
     _sources(lookup, route)
-    if not route.destinations and not route.topics:
+    is_setter = any(True for _ in sets_state(lookup.table.states.values(), route))
+    if not route.destinations and not route.topics and not is_setter:
         places = "destinations" if route.is_outbound else "destinations or topics"
         message, hint = f"'{route.name}' has no targets", f"add {places}, or ignore it with `ignore: reason`"
         lookup.report(route.span, Code.NO_TARGET, message, hint)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, GatewayPlan, RoutePlan, source_label
+from router.compiler.compiled_table import (
+    STRANGER,
+    CompiledTable,
+    DeadmanPlan,
+    GatewayPlan,
+    RoutePlan,
+    StatePlan,
+    source_label,
+)
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
@@ -38,6 +46,8 @@ def open_series(program: CompiledTable) -> None:
         _open_deadman(counters, deadman)
     for gateway in program.gateways:
         _open_gateway(counters, gateway)
+    for state in program.states:
+        _open_state(counters, state)
 
 
 def _open(counters: Counters, metrics: Iterable[str], *labels: str) -> None:
@@ -101,6 +111,14 @@ def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
         _open(counters, delivered, route, target.label)
         if target.is_topic and plan.collect_timeout is not None:
             counters.index("messages_collected", route, target.label)
+
+
+def _open_state(counters: Counters, plan: StatePlan) -> None:
+    _open(counters, ("state", "state_changes"), plan.name)
+    for route, sources in plan.setters.items():
+        _open_each(counters, "state_set_seconds", plan.name, last=sorted(sources))
+        counters.set_commands(route, plan.label, are_commands=True)  # what it lets pass may be commands
+        _open_each(counters, "messages_dropped", route, plan.label, last=DROP_REASONS)
 
 
 def _open_deadman(counters: Counters, plan: DeadmanPlan) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from router import declared as c
 from router.compiler.checked import Target
-from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, RoutePlan, TopicPlan
+from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, RoutePlan, StatePlan, TopicPlan
 from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
@@ -94,6 +94,10 @@ class Openings:
         topics = tuple(_plain(target) for target in plan.targets if target.is_topic)
         payload = plan.case.name, self.program.protos_sha256
         return self._open(("collector", plan.route), "collector_open", plan.collect_timeout, of=(*payload, *topics))
+
+    def state(self, plan: StatePlan) -> int:
+        """Open a state, which keeps its value as long as it has the same type."""
+        return self._open(("state", plan.name), "state_open", of=(plan.type,))
 
     # deadmen
 

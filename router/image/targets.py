@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from router import declared as c
 from router.compiler.checked import Target
-from router.compiler.compiled_table import STRANGER, Beside, CompiledTable, RoutePlan, source_label
+from router.compiler.compiled_table import STRANGER, Beside, CompiledTable, RoutePlan, StatePlan, source_label
 from router.compiler.lowering import LoweredCollect, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
+from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.refusals import DROP_REASON_NAMES
 from router.image.openings import Openings, period
@@ -43,12 +44,64 @@ class TargetWriter:
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _besides: dict[str, c.Beside] = field(default_factory=dict)
     _sources: Any = None
+    states: Any = None
+    """The settings of all states; None without any."""
+
+    def __post_init__(self) -> None:
+        self.states = self.arrays.array(c.StateSettings, [self._state(plan) for plan in self.program.states])
+
+    def routines(self, layout: Layout) -> Routines:
+        """Return what writes the routines of a layout."""
+        return Routines(layout, self.arrays, self.states)
+
+    def _state(self, plan: StatePlan) -> c.StateSettings:
+        counters, symbol = self.program.counters, self.openings.state(plan)
+        self.timers.append(Timer(symbol))
+        return c.StateSettings(
+            state=symbol,
+            initial=_signed(plan.initial),
+            valid_for=c.NEVER if plan.valid_for is None else plan.valid_for,
+            id=self.openings.names.number(plan.name),
+            value=counters.index("state", plan.name),
+            changes=counters.index("state_changes", plan.name),
+        )
+
+    def setters(self, plan: RoutePlan) -> Iterator[c.Setter]:
+        """Yield what the messages of a route set: each state, for each sender."""
+        counters, number = self.program.counters, self.openings.names.number
+        columns = {name: column for column, name in enumerate(self.program.table.endpoints)}
+        for state in self.program.states:
+            sources = sorted(state.setters.get(plan.route, ()), key=columns.__getitem__)
+            if not sources:
+                continue
+            lowered = self.program.lowered.states[state.name]
+            routines = self.routines(lowered.layout)
+            target = c.Target(message=routines.routine(lowered.routine), id=number(state.label))
+            target.dropped[:] = [
+                counters.index("messages_dropped", plan.route, state.label, reason) for reason in DROP_REASON_NAMES
+            ]
+            layout, targets = routines.layout(), ctypes.pointer(self.arrays.add(target))
+            for source in sources:
+                yield c.Setter(
+                    state=self.openings.state(state),
+                    to=c.Targets(
+                        layout=layout,
+                        sources=self.names_of_senders(),
+                        targets=targets,
+                        count=1,
+                        route=number(plan.route),
+                        topic=c.NO_NAME,
+                    ),
+                    column=columns[source],
+                    source=number(source),
+                    age=counters.index("state_set_seconds", state.name, source),
+                )
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[Target], lowered: LoweredRoute | None) -> c.Targets:
         """Write the targets that get datagrams; `lowered` are the routines of targets that have some."""
         if lowered is None:
             return self.targets(plan, targets, None)
-        routines = Routines(lowered.layout, self.arrays)
+        routines = self.routines(lowered.layout)
         written = self.targets(plan, targets, routines)
         if lowered.collect is not None:
             collect = write_collect(lowered.collect, routines, self._numbers_of_senders())
@@ -92,7 +145,10 @@ class TargetWriter:
         counters, place = self.program.counters, (plan.route, target.label)
         written = self._topic(target.label) if target.is_topic else self._destination(target.label)
         if routines is not None:
-            written.condition, written.message = map(routines.routine, (target.condition, target.message))
+            routine = routines.routine
+            written.condition, written.message, written.gate = map(
+                routine, (target.condition, target.message, target.gate)
+            )
         written.id = self.openings.names.number(target.label)
         written.waiting = counters.index("messages_waiting", *place)
         written.filtered = counters.index("messages_filtered", *place)
@@ -163,6 +219,11 @@ class TargetWriter:
         if self._sources is None:
             self._sources = native_values([label.encode() for label in self._labels_of_senders()], self.arrays)
         return self._sources
+
+
+def _signed(value: int) -> int:
+    """Return the signed integer with the same 64 bits."""
+    return value - (1 << 64) if value >= 1 << 63 else value
 
 
 def write_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:

@@ -116,6 +116,8 @@ class _Writer:
             listener_count=len(program.listeners),
             case_count=len(program.envelope.numbers),
             unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
+            state_count=len(program.states),
+            states=self.targets.states,
             schema=ctypes.pointer(write_schema(program.envelope, program.inbound.keys(), self.arrays)),
             listeners=self.arrays.array(c.Listener, [self._listener(*each) for each in self._framings()]),
             cases=self.arrays.array(c.PayloadCase, self._cases()),
@@ -208,8 +210,10 @@ class _Writer:
         )
         if topics:
             route.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
-        witnesses = [*self._witnesses(plan)]
+        setters, witnesses = [*self.targets.setters(plan)], [*self._witnesses(plan)]
+        route.setters, route.setter_count = self.arrays.array(c.Setter, setters), len(setters)
         route.witnesses, route.witness_count = self.arrays.array(c.Witness, witnesses), len(witnesses)
+        route.is_watched = bool(setters or witnesses)
         return route
 
     def _witnesses(self, plan: RoutePlan) -> Iterator[c.Witness]:
@@ -220,7 +224,7 @@ class _Writer:
 
     def _witness(self, deadman: DeadmanPlan, endpoint: str) -> c.Witness:
         lowered, openings = self.program.lowered.obeyed[deadman.route], self.targets.openings
-        routines = Routines(lowered.layout, self.arrays)
+        routines = self.targets.routines(lowered.layout)
         return c.Witness(
             deadman=openings.deadman(deadman),
             condition=routines.routine(lowered.routine),
@@ -247,7 +251,7 @@ def _ros_routes(writer: TargetWriter, topic: str, feeds: tuple[LoweredFeed, ...]
 
 def _ros_route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.RosRoute:
     assert plan.topic is not None  # noqa: S101 - a route from ROS has a topic
-    counters, routines = writer.program.counters, Routines(feed.layout, writer.arrays)
+    counters, routines = writer.program.counters, writer.routines(feed.layout)
     targets = writer.targets(plan, plan.targets, routines)
     for_each = write_for_each(feed.for_each, routines)
     targets.layout = routines.layout()

@@ -1,4 +1,4 @@
-"""Publishes `/diagnostics` once per second: a status for the router and each listener, endpoint, route and gateway."""
+"""Publishes `/diagnostics` once per second: for the router, and each listener, endpoint, route, gateway and state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from router.clock import wall_ns
 from router.compiler.cdr import HEADER, put_length, put_text
-from router.compiler.compiled_table import GatewayPlan
+from router.compiler.compiled_table import GatewayPlan, StatePlan
 from router.log import logger
 from router.observe import problems
 from router.observe.health import PERIOD, HealthSnapshot
@@ -119,6 +119,8 @@ class Report:
                 yield self._route(route)
         for gateway in self._program.gateways:
             yield self._gateway(gateway)
+        for state in self._program.states:
+            yield self._state(state)
 
     def _router(self) -> Status:
         """Return the router's status, with the problems that belong to no listener, endpoint or route."""
@@ -189,6 +191,20 @@ class Report:
         ]
         problems = [*self._labelled(name, "listener"), *self._concerning(name)]
         return _status(f"gateway/{name}", self._host, problems, "serves its clients", values)
+
+    def _state(self, state: StatePlan) -> Status:
+        """Return the value of a state, and for each sender how long ago it last set the state."""
+        value = state.shown(int(self._health.now.counts("state")[(state.name,)]))
+        ages = self._health.now.counts("state_set_seconds")
+        setters = [(source, age) for (name, source), age in ages.items() if name == state.name]
+        values = [
+            ("value", value),
+            ("initial value", state.shown(state.initial)),
+            *((f"set by {source}", age_text(age)) for source, age in sorted(setters, key=lambda each: each[1])),
+            *((f"dropped: {reason}", n) for reason, n in self._dropped_for[state.label].items()),
+            ("changes", self._total("state_changes", state.name)),
+        ]
+        return _status(f"state/{state.name}", self._host, (), value, values)
 
     def _labelled(self, name: str, *labels: str) -> list[Problem]:
         return [each for each in self._health.problems if any(each.labels.get(label) == name for label in labels)]

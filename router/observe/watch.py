@@ -25,6 +25,9 @@ METRICS = {kind.metric for kind in Kind} | {
     "messages_received",
     "mirror_dropped",
     "recordings_lost",
+    "state",
+    "state_changes",
+    "state_set_seconds",
     "topic_subscribers",
     *DELIVERED,
 }

@@ -41,12 +41,16 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What happened in a step: events before its time (`early`) and in it. `given` has times and bytes of messages."""
+    """What happened in a step: events before its time (`early`) and in it, and the states after it.
+
+    `given` has times and bytes of messages.
+    """
 
     step: Step
     early: Sequence[Event]
     events: Sequence[Event]
     given: Sequence[tuple[int, bytes]]
+    states: Mapping[str, str]
 
     def given_at(self, at: int) -> int:
         """Return the arrival (ns) of the last message that a delivery at this time can contain."""
@@ -82,6 +86,13 @@ class Comparison:
         yield from self._dropped(outcome)
         yield from _filtered(expected, events)
         yield from self._answers(expected, events)
+        yield from self._states(outcome)
+
+    def _states(self, outcome: Outcome) -> Iterator[Failure]:
+        for name, wanted in outcome.step.expected.states.items():
+            if (actual := outcome.states[name]) != wanted.value:
+                related = Related(self._table.states[name].span, "the state")
+                yield Failure(wanted.span, f"state.{name} is {actual}, not {wanted.value}", related)
 
     def _early(self, outcome: Outcome) -> Iterator[Failure]:
         """Yield a failure for each place with an event between the previous step and this one."""

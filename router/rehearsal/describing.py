@@ -27,6 +27,7 @@ from router.rehearsal.rehearsal import (
     Received,
     Rejected,
     Sent,
+    StateChanged,
     Superseded,
 )
 from router.types.model import MessageType
@@ -169,8 +170,8 @@ class EventDescriber:
                 return f"{at}{event.listener} rejects a datagram as {event.reason}{in_brackets(event.detail)}"
             case Superseded():
                 return f"{at}{event.listener} uses only the last payload of a datagram{in_brackets(event.detail)}"
-            case DeadmanChanged() | Obeyed() | Disobeyed():
-                return at + _of_deadman(event)
+            case DeadmanChanged() | Obeyed() | Disobeyed() | StateChanged():
+                return at + _of_change(event)
         raise AssertionError(event)
 
     def _datagram(self, data: bytes) -> str:
@@ -183,12 +184,14 @@ class EventDescriber:
 
 def _kind(event: Event) -> tuple[object, ...]:
     """Return a key that is equal for events that differ only in time and content."""
-    names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman"))
+    names = (getattr(event, name, None) for name in ("route", "target", "source", "reason", "by_deadman", "state"))
     return type(event), *names
 
 
-def _of_deadman(event: DeadmanChanged | Obeyed | Disobeyed) -> str:
+def _of_change(event: DeadmanChanged | Obeyed | Disobeyed | StateChanged) -> str:
     match event:
+        case StateChanged(_, state, before, after, source):
+            return f"state.{state} changes from {before} to {after}" + (f", set by {source}" if source else "")
         case DeadmanChanged():
             return f"the deadman of {event.route} {'trips' if event.active else 'is released'}"
         case Obeyed():

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from router.carrier.events import CountedReport, DeadmanChange
+from router.carrier.events import CountedReport, DeadmanChange, StateChange
 from router.carrier.simulation import Increment, Output, Simulation, Time
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Series
@@ -125,6 +125,16 @@ class Disobeyed(Event):
     target: str
 
 
+@dataclass(frozen=True, slots=True)
+class StateChanged(Event):
+    """The value of a state changed. `source` set it; None if it expired."""
+
+    state: str
+    before: str
+    after: str
+    source: str | None
+
+
 EVENTS: Mapping[str, Callable[[int, tuple[str, ...], bytes], Event]] = {
     "messages_received": lambda at, labels, _: Received(at, *labels),
     "datagrams_sent": lambda at, labels, data: Sent(at, labels[0], labels[1], data),
@@ -146,7 +156,7 @@ class Rehearsal:
     """One run of a program, from the state of a router that has just started.
 
     `now` is the boot clock, in ns, and also the wall clock until that is set. `events` has what happened, in order; the
-    caller may clear it. The same calls give the same events.
+    caller may clear it. `states` has the present values, as the table writes them. The same calls give the same events.
     """
 
     def __init__(self, program: CompiledTable, start_ns: int = START) -> None:
@@ -158,6 +168,8 @@ class Rehearsal:
         self._data = b""
         self._simulation.adopt(program)
         self._series = _series(program)
+        self._plans = {plan.name: plan for plan in program.states}
+        self.states = self._initial()
 
     @property
     def now(self) -> int:
@@ -191,12 +203,15 @@ class Rehearsal:
         """Continue with another program, whose counters continue those of the current one."""
         self._simulation.adopt(program)
         self._series |= _series(program)
+        self._plans = {plan.name: plan for plan in program.states}
+        self.states = self._initial() | {name: value for name, value in self.states.items() if name in self._plans}
         self._read()
 
     def restart(self) -> None:
         """Start again with the current program, as a router that has just started."""
         self._simulation.restart(self._start)
         self._at, self.ahead, self._data = self._start, 0, b""
+        self.states = self._initial()
         self.events.clear()
 
     def close(self) -> None:
@@ -219,8 +234,19 @@ class Rehearsal:
                     self.events.append(Obeyed(self._at, route, endpoint, after))
                 case Answer(route, endpoint):
                     self.events.append(Disobeyed(self._at, route, endpoint))
+                case StateChange():
+                    self._change(record)
                 case CountedReport(_, report):
                     self._report(report.detail or str(report.error or ""))
+
+    def _initial(self) -> dict[str, str]:
+        return {name: plan.shown(plan.initial) for name, plan in self._plans.items()}
+
+    def _change(self, change: StateChange) -> None:
+        plan = self._plans[change.state]
+        before, after = plan.shown(change.before), plan.shown(change.after)
+        self.states[change.state] = after
+        self.events.append(StateChanged(self._at, change.state, before, after, change.source))
 
     def _count(self, counter: int) -> None:
         """Make an event from a counter: only counters have both the route and the target."""

@@ -78,7 +78,7 @@ def _run_step(step: Step, rehearsal: Rehearsal, program: CompiledTable) -> Outco
     if step.stop:
         rehearsal.close()
     early = [event for event in rehearsal.events if event.at < begin]
-    return Outcome(step, early, rehearsal.events[len(early) :], given)
+    return Outcome(step, early, rehearsal.events[len(early) :], given, dict(rehearsal.states))
 
 
 def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, bytes]]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from router.compiler import Checked
-from router.compiler.compiled_table import CompiledTable
+from router.compiler.compiled_table import CompiledTable, StatePlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.datagrams import Peer
@@ -84,7 +84,8 @@ class Expected:
     """Everything that may happen in a step. With `anything`, nothing is compared.
 
     `rejected`, `filtered` and `route` are None if the test does not mention them. `obeyed` and `disobeyed` count
-    endpoints that begin to obey the brake of a deadman, or to disobey it.
+    endpoints that begin to obey the brake of a deadman, or to disobey it. `states` are at the end of the step, as the
+    table writes their values.
     """
 
     span: SourceSpan
@@ -97,6 +98,7 @@ class Expected:
     obeyed: Located[Counts] | None = None
     disobeyed: Located[Counts] | None = None
     route: Located[str] | None = None
+    states: Mapping[str, Located[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +201,13 @@ class Names:
         return self._subscribed[self._known(name, self._subscribed, span, "route from the topic")]
 
     def target(self, name: str, span: SourceSpan) -> str:
-        """Return an endpoint or a topic that a route delivers to."""
-        return self._known(name, [*self._destinations, *self._published], span, "route to")
+        """Return an endpoint or a topic that a route delivers to, or a state as `state.NAME`."""
+        states = [state.label for state in self._program.states]
+        return self._known(name, [*self._destinations, *self._published, *states], span, "route to")
+
+    def state(self, name: str, span: SourceSpan) -> StatePlan:
+        states = {state.name: state for state in self._program.states}
+        return states[self._known(name, states, span, "state", Code.UNKNOWN_STATE)]
 
     @cached_property
     def _destinations(self) -> Sequence[str]:
@@ -342,7 +349,12 @@ class ExpectedReader:
             obeyed=self._counted(node.entries.get("obeyed"), self._names.watched),
             disobeyed=self._counted(node.entries.get("disobeyed"), self._names.watched),
             route=Located(self._names.route(*_name(route.value)), route.value.span) if route else None,
+            states=self._states(node.get("state")),
         )
+
+    def _states(self, node: Node | None) -> Mapping[str, Located[str]]:
+        entries = node.entries.items() if isinstance(node, MappingNode) else ()
+        return {name: _state(self._names.state(name, entry.key.span), entry.value) for name, entry in entries}
 
     def _sent(self, node: Node | None, given: Node | None) -> Deliveries:
         if not isinstance(node, MappingNode):
@@ -422,6 +434,15 @@ class ExpectedReader:
             counts = {known(name, counted.key.span): _count(counted.value) for name, counted in node.entries.items()}
             return Located(counts, entry.key.span)
         return Located(Counter(known(*_name(item)) for item in _listed(node)), entry.key.span)
+
+
+def _state(plan: StatePlan, node: Node) -> Located[str]:
+    """Return the expected value of a state, as the table writes it."""
+    text, span = _name(node)
+    if plan.values is not None and text not in plan.values:
+        message = f"'{text}' is not a value of the state '{plan.name}'"
+        raise InvalidValueError(span, Code.BAD_VALUE, message, did_you_mean(text, plan.values))
+    return Located(text, span)
 
 
 def _reasons(node: Node, known: Iterable[str]) -> Counts:

@@ -37,6 +37,7 @@ from router.table.model.gateways import (
 )
 from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
+from router.table.model.state import State
 from router.table.model.targets import Destination, Topic
 from router.table.nodes import (
     EACH,
@@ -122,6 +123,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         foxglove=builder.one(root, "foxglove", _server),
         reload_on_change=builder.one(root, "reload", _reload) or False,
         networks=builder.one(root, "networks", _networks),
+        states=builder.each(root, "state", _named(State)),
     )
 
 

@@ -255,6 +255,7 @@ def _bytes(shape: str, units: Mapping[str, int], base: str, largest: int, smalle
 
 DURATION = Quantity("duration", parse_duration, duration)
 PATIENCE = _or("patience", NEVER, DURATION, instead=None)
+VALIDITY = _or("patience", NEVER, DURATION)
 PERIOD = _or("period", EACH, Quantity("duration", parse_period, duration))
 INTERVAL = Quantity("duration", parse_interval, duration)
 RATE = Quantity("rate", parse_rate, rate)

@@ -19,6 +19,7 @@ from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.selection import TopicSelector
+from router.compiler.states import sets_state
 from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
 from router.errors import ConfigurationError, UsageError, plural, shown_path
@@ -39,6 +40,7 @@ from router.table.model.gateways import (
     ZenohSettings,
 )
 from router.table.model.routes import ANY, ROS, Route
+from router.table.model.state import State
 from router.table.model.targets import OnLimit, Topic
 from router.table.units import duration
 from router.tools.udp import LOOPBACK, origin
@@ -70,6 +72,8 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
         return
     yield f"  source: {', '.join(_source(source.value, table) for source in route.sources) or ROS}"
     yield from _settings(checked)
+    for state in sets_state(table.states.values(), route):
+        yield f"  sets {_set(state, route)}  ({state.span})"
     for served in checked.targets:
         yield ""
         if served.topic:
@@ -138,6 +142,16 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
         yield f"  no deadman: {route.no_deadman}"
     if no_ttl := phrases(route).get("no_ttl"):
         yield f"  {no_ttl}"
+
+
+def _set(state: State, route: Route) -> str:
+    """Describe what messages of a route do to a state: `state.mode: mode, for 5 s, then MODE_MANUAL`."""
+    own = {source.value for source in route.sources}
+    senders = [source.value for source in state.sources if {source.value, ANY} & own]
+    valid = state.valid_for.value if state.valid_for else 0
+    ends = f"for {duration(valid)}, then {state.initial.text}" if valid else f"{state.initial.text} before the first"
+    by = f" from {', '.join(senders)}" if own != {*senders} else ""
+    return f"state.{state.name}: {state.value.text}{by}, {ends}"
 
 
 def _source(name: str, table: RouteTable) -> str:

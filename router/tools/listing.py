@@ -230,6 +230,7 @@ _OPERANDS: Mapping[Op, Callable[[_Line], str]] = {
     Op.INTEGER: _number,
     Op.REAL: _number,
     Op.TEXT: _text,
+    Op.STATE: _of_slot,
     Op.LOAD: _of_slot,
     Op.KEEP: _of_slot,
     Op.JUMP: _jump,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -394,9 +395,9 @@ def test_targets_are_lowered_by_what_feeds_them(check_text: CheckText) -> None:
 def test_each_target_is_lowered_once(definitions: Definitions, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 
-    def counted(target: Target, condition: Routine, message: Routine, places: tuple[str, ...]) -> Target:
+    def counted(target: Target, places: tuple[str, ...], **routines: Any) -> Target:
         made.append(places[-1])
-        return replace(target, condition=condition, message=message, places=places)
+        return replace(target, places=places, **routines)
 
     monkeypatch.setattr(sources, "replace", counted)
     program = check_table(ROUTES / "rover.yaml", {}, definitions).program

@@ -19,6 +19,8 @@ endpoints:
 routes:
   ph_info: {{source: [sensor_board, arm_board]}}
   manual_drive: {{deadman: {{obeyed: {{drive_diag: abs(front_left_motor.rpm) < 5, within: 2s}}}}}}
+state:
+  mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}
 gateways:
   dashboard:
     inbound:

@@ -25,7 +25,7 @@ def reported(router: Counting, after: float) -> dict[str, Status]:
     return {status.name: status for status in Report(router.look(after)).statuses()}
 
 
-def test_there_is_a_status_for_the_router_and_each_listener_endpoint_route_and_gateway(router: Counting) -> None:
+def test_there_is_a_status_for_the_router_and_each_listener_endpoint_route_gateway_and_state(router: Counting) -> None:
     table, told = router.program.table, reported(router, 2)
     assert [*told] == [
         "router",
@@ -33,10 +33,30 @@ def test_there_is_a_status_for_the_router_and_each_listener_endpoint_route_and_g
         *(f"endpoint/{name}" for name in table.endpoints),
         *(f"route/{route.name}" for route in table.routes),
         "gateway/dashboard",
+        "state/mode",
     ]
     assert {status.level for status in told.values()} == {Level.OK}
     assert told["endpoint/sensor_board"].hardware_id == "192.168.0.30:8"
     assert told["route/imu_info"].hardware_id == told["router"].hardware_id != ""
+
+
+def test_a_state_is_reported_with_its_age_and_who_set_it(router: Counting) -> None:
+    status = reported(router, 1)["state/mode"]
+    assert status.message == "MODE_MANUAL"
+    assert "set by basestation" not in dict(status.values)
+    router.count("state", "mode", to=1)
+    router.count("state_changes", "mode", to=3)
+    router.count("state_set_seconds", "mode", "basestation", to=router.now)
+    router.count("messages_dropped", "control_mode", "state.mode", "mapping_error", to=2)
+    status = reported(router, 2.5)["state/mode"]
+    assert (status.level, status.message) == (Level.OK, "MODE_AUTO")
+    assert dict(status.values) == {
+        "value": "MODE_AUTO",
+        "initial value": "MODE_MANUAL",
+        "set by basestation": "2.5 s",
+        "dropped: mapping_error": "2",
+        "changes": "3",
+    }
 
 
 def test_the_table_is_reported_by_its_name(router: Counting) -> None:

@@ -57,7 +57,7 @@ static void hold(struct thread_env *env, struct deferral *deferral, const uint8_
     timer_set_due(env->timers, &deferral->timer, deferral->limit.next_pass);
 }
 
-/* Deliver the held message, unless it has expired. */
+/* Deliver the held message, unless it has expired or a state no longer lets it pass. */
 static void release(struct timers *timers, struct deferral *deferral, int64_t now) {
     if (!deferral->is_held) return;
     forget(timers, deferral);
@@ -65,6 +65,7 @@ static void release(struct timers *timers, struct deferral *deferral, int64_t no
         lose_stale(timers->env, deferral->of.to, deferral->of.target, now, deferral->expires, REFUSED_WAITING);
         return;
     }
+    if (!may_leave(timers->env, deferral->of.to, deferral->of.target)) return;
     struct output *held = &deferral->held;
     if (deferral->of.target->topic) { /* which gets the machine's output */
         exchange(held, &timers->env->machine.output);

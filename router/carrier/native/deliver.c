@@ -7,6 +7,7 @@
 #include "defer.h"
 #include "envelope.h"
 #include "evaluate.h"
+#include "state.h"
 
 /* One message on its way to one target. */
 struct delivery {
@@ -117,6 +118,15 @@ static bool meets_condition(const struct delivery *of) {
     if (outcome != EVALUATED) return refuse(of, outcome, PLACE_CONDITION);
     if (!is_true) count(of, of->target->filtered);
     return is_true;
+}
+
+bool passes_gate(struct thread_env *env, const struct targets *to, const struct target *target) {
+    bool is_true;
+    uint32_t at;
+    machine_begin(&env->machine, to->layout);
+    if (evaluate_condition(&env->machine, &target->gate, &is_true, &at) == EVALUATED && is_true) return true;
+    env_count(env, target->filtered, 1);
+    return false;
 }
 
 /* The age of a message is uncertain: the oldest reading counts for a command to a board, the youngest for others. */
@@ -276,6 +286,10 @@ static int brake_by_socket(struct thread_env *env, const struct deadman_destinat
     return sender_send_checked(to->sender, datagram->data, datagram->size);
 }
 
+static int64_t present_state(struct thread_env *env, const struct state_settings *of) {
+    return state_value(of->state, env->now(env));
+}
+
 bool env_open(struct thread_env *env, counter *counters, struct ring *events, struct timers *timers) {
     memset(env, 0, sizeof *env);
     env->counters = counters;
@@ -283,9 +297,12 @@ bool env_open(struct thread_env *env, counter *counters, struct ring *events, st
     env->timers = timers;
     env->now = clock_now;
     env->wall = clock_wall;
+    env->state = present_state;
     env->send = send_by_socket;
     env->brake = brake_by_socket;
-    return machine_open(&env->machine);
+    if (!machine_open(&env->machine)) return false;
+    env->machine.env = env;
+    return true;
 }
 
 void env_close(struct thread_env *env) { machine_close(&env->machine); }

@@ -7,7 +7,7 @@
  *     rate        `max_rate`                                          else rate_limited
  *     message     the output of its routine, or the envelope as it was received
  *     board       what the firmware can decode                        else too_large, non_finite, missing_field
- *     defer       `on_limit: latest` and `bandwidth` (defer.h)
+ *     defer       `on_limit: latest` and `bandwidth` (defer.h); when it leaves, the condition's states again
  *     send or publish, and feed deadmen
  *
  * Each target counts every message once. Losses are reported, except those by `max_rate`, which the table requests.
@@ -77,6 +77,7 @@ struct target {
     /* Counters. `waiting` is for a target whose messages pass a ring, `collected` for one that gets frames,
      * `delivered_bytes` for a destination. */
     uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[DROP_REASONS];
+    struct routine gate; /* the part of the condition that only reads states; empty if messages are never held */
 };
 
 /* The first slots of every layout of datagrams. */
@@ -138,6 +139,8 @@ struct thread_env {
     /* The boot clock and the wall clock, ns. */
     int64_t (*now)(struct thread_env *env);
     int64_t (*wall)(struct thread_env *env);
+    /* The present value of a state. */
+    int64_t (*state)(struct thread_env *env, const struct state_settings *of);
     /* Send as `command_send` does. The caller has just checked the age. */
     int (*send)(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
     /* Send a datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */
@@ -184,6 +187,13 @@ void lose_refused(struct thread_env *env, const struct targets *to, const struct
 /* Likewise for an expired message, older than `ttl`. `since` is the event that its age counts from. */
 void lose_stale(struct thread_env *env, const struct targets *to, const struct target *target, int64_t now, int64_t expires,
                 enum refused since);
+
+/* Whether states still let a message that was held leave, for a target with a gate; otherwise count it as filtered. */
+bool passes_gate(struct thread_env *env, const struct targets *to, const struct target *target);
+
+static inline bool may_leave(struct thread_env *env, const struct targets *to, const struct target *target) {
+    return !target->gate.count || passes_gate(env, to, target);
+}
 
 /* Send these bytes, or publish the machine's output, and count that. Return false if the thread was abandoned. */
 bool deliver_now(struct thread_env *env, const struct targets *to, const struct target *target, const uint8_t *data,

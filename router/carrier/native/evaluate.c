@@ -3,12 +3,20 @@
 #include <math.h>
 
 #include "arithmetic.h"
+#include "deliver.h"
 #include "events.h"
 #include "lists.h"
+#include "state.h"
 #include "texts.h"
 #include "utf8.h"
 #include "write_cdr.h"
 #include "write_protobuf.h"
+
+/* ---- states ---- */
+
+static int64_t present_state(const struct machine *machine, int64_t index) {
+    return machine->env->state(machine->env, &machine->layout->states[index]);
+}
 
 /* ---- lists ---- */
 
@@ -155,6 +163,7 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         case OP_LOAD: *++top = slots[op->slot]; break;
         case OP_KEEP: slots[op->slot] = *top; break;
         case OP_DROP: top--; break;
+        case OP_STATE: slots[op->slot].integer = present_state(machine, op->integer); break;
 
         case OP_ADD: top--; top->bits += top[1].bits; break;
         case OP_SUBTRACT: top--; top->bits -= top[1].bits; break;

@@ -15,7 +15,8 @@ enum event_kind {
     EVENT_OBEYED,
     EVENT_DISOBEYED,
     EVENT_EVIDENCE,
-    EVENT_RETURNED
+    EVENT_RETURNED,
+    EVENT_STATE
 };
 
 /* The beginning of every event. */
@@ -49,6 +50,12 @@ struct returned_event {
     uint32_t size, kind; /* EVENT_RETURNED: an endpoint is heard again */
     uint32_t endpoint, reserved;
     int64_t silence;     /* ns */
+};
+
+struct state_event {
+    uint32_t size, kind;    /* EVENT_STATE: the value of a state has changed */
+    uint32_t state, source; /* `source`: the sender that set it, or NO_NAME: it has expired, or a reload has changed it */
+    int64_t before, after;
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

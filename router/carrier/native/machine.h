@@ -26,8 +26,11 @@ enum {
     BYTES_PER_TURN = 16
 };
 
+struct thread_env;
+
 struct machine {
     const struct layout *layout;
+    struct thread_env *env; /* which has the values of states; NULL if no routine reads one */
     struct value *slots;
     struct cell *cells; /* its address changes when it grows */
     uint32_t cell_count, cell_capacity;

@@ -70,6 +70,7 @@ enum op {
     OP_LOAD,    /* pushes the value in `slot` */
     OP_KEEP,    /* copies the top value to `slot` */
     OP_DROP,    /* pops a value */
+    OP_STATE,   /* copies the present value of the layout's state `integer` to `slot` */
     /* Integers. `flag` (enum sign) says which operands are unsigned, and whether the result is. The plain operations wrap
      * around at 2^64, and are for results that always fit. The CHECKED ones, and division, refuse a result that does not: */
     OP_ADD,
@@ -275,6 +276,8 @@ struct section {
     uint16_t first_slot, slot_count; /* for a list element: its slots, including those of nested messages */
 };
 
+struct state_settings;
+
 /* The common part of routines that read the same messages. */
 struct layout {
     const struct section *sections; /* the first one is the message */
@@ -284,6 +287,7 @@ struct layout {
     uint32_t slot_count;
     uint16_t is_cdr;
     uint16_t envelope; /* section of the envelope of a datagram, 0 if no routine reads fields beside the payload */
+    const struct state_settings *states; /* of the program; NULL without any */
 };
 
 #endif

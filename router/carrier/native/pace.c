@@ -108,7 +108,7 @@ static const struct waiting_datagram *take_off(struct pacer *pacer, struct lane 
     return taken;
 }
 
-/* Send the first datagram, or drop it if it has expired. Return whether it was sent. */
+/* Send the first datagram, or drop it if it has expired or a state no longer lets it pass. Return whether it was sent. */
 static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *lane, int64_t now) {
     const struct waiting_datagram *first = take_off(pacer, lane);
     const struct route_target *of = first->of;
@@ -117,6 +117,7 @@ static bool send_first(struct timers *timers, struct pacer *pacer, struct lane *
         lose_stale(timers->env, of->to, of->target, now, first->expires, REFUSED_WAITING);
         return false;
     }
+    if (!may_leave(timers->env, of->to, of->target)) return false;
     pacer->paid_at += first->cost;
     timers->arrived = first->arrived;
     deliver_now(timers->env, of->to, of->target, (const uint8_t *)(first + 1), first->size, first->expires, now);

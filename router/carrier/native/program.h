@@ -11,6 +11,7 @@
 #include "deadman.h"
 #include "deliver.h"
 #include "envelope.h"
+#include "state.h"
 
 /* A condition on the messages of a route from one sender. If it holds, the sender obeys the brake of this deadman. */
 struct witness {
@@ -26,9 +27,12 @@ struct witness {
 struct route {
     struct targets sends;     /* destinations, which the receive thread serves */
     struct targets publishes; /* topics, which the publish thread serves */
+    const struct setter *setters;
     const struct witness *witnesses;
-    uint32_t witness_count, reserved;
+    uint32_t setter_count, witness_count;
     uint32_t last_message, duration; /* counters: boot clock; a histogram has HISTOGRAM_BOUNDS + 2 */
+    uint32_t is_watched; /* it has setters or witnesses */
+    uint32_t reserved;
 };
 
 /* The route for messages of one sender with one payload case: its index, or -1. */
@@ -71,6 +75,8 @@ struct program {
     uint32_t generation;
     uint32_t listener_count, case_count;
     uint32_t unknown_case; /* counter */
+    uint32_t state_count, reserved;
+    const struct state_settings *states;
     const struct wire_schema *schema;
     const struct listener *listeners;
     const struct payload_case *cases; /* by number */

@@ -102,6 +102,28 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
         drop_oldest(routing, received->now);
 }
 
+/* ---- states ---- */
+
+/* Set a state to the value of the datagram, unless it has none. */
+static void set_state(struct routing *routing, const struct setter *setter, const struct received *received,
+                      const struct datagram *datagram) {
+    struct machine *machine = &routing->env.machine;
+    const struct target *state = setter->to.targets;
+    struct lost_event lost = {.reason = DROP_MAPPING_ERROR, .generation = setter->to.generation, .place = PLACE_MESSAGE};
+    if (read_datagram(machine, setter->to.layout, setter->to.sources, datagram)) {
+        struct value value;
+        uint32_t at;
+        int outcome = evaluate_value(machine, &state->message, &value, &at);
+        if (outcome == EVALUATED) {
+            state_set(routing->env.timers, setter, value.integer, received->times.oldest);
+            return;
+        }
+        lost.reason = (uint32_t)outcome;
+        lost.place = PLACE_OPERATIONS + at;
+    }
+    lose_refused(&routing->env, &setter->to, state, received->now, lost);
+}
+
 /* ---- witnesses ---- */
 
 static bool meets_condition(struct machine *machine, const struct witness *witness, const struct datagram *datagram) {
@@ -122,15 +144,24 @@ static void report_evidence(struct routing *routing, const struct witness *witne
 }
 
 /* Show the datagram to deadmen that send to its sender. A condition without a result is not met. */
-static void show_to_deadmen(struct routing *routing, const struct route *route, const struct received *received) {
-    struct datagram datagram = datagram_of(routing, received);
+static void show_to_deadmen(struct routing *routing, const struct route *route, const struct received *received,
+                            const struct datagram *datagram) {
     for (uint32_t index = 0; index < route->witness_count; index++) {
         const struct witness *witness = &route->witnesses[index];
         if (witness->column != received->column || !deadman_is_tripped(witness->deadman)) continue;
-        bool obeys = meets_condition(&routing->env.machine, witness, &datagram);
+        bool obeys = meets_condition(&routing->env.machine, witness, datagram);
         if (deadman_is_shown(routing->env.timers, witness->deadman, witness->endpoint_id, obeys, received->times.oldest))
-            report_evidence(routing, witness, &datagram);
+            report_evidence(routing, witness, datagram);
     }
+}
+
+/* Set the states that the datagram sets, and show it to deadmen. */
+static void watch(struct routing *routing, const struct route *route, const struct received *received) {
+    struct datagram datagram = datagram_of(routing, received);
+    for (uint32_t index = 0; index < route->setter_count; index++)
+        if (route->setters[index].column == received->column)
+            set_state(routing, &route->setters[index], received, &datagram);
+    show_to_deadmen(routing, route, received, &datagram);
 }
 
 /* ---- routing ---- */
@@ -176,7 +207,7 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     env_count(&routing->env, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
-    if (chosen->witness_count) show_to_deadmen(routing, chosen, received);
+    if (chosen->is_watched) watch(routing, chosen, received);
     counter_set(routing->env.counters, chosen->last_message, received->now);
     return ROUTED;
 }
@@ -236,6 +267,7 @@ void routing_adopt(struct routing *routing, const struct change *change) {
     for (uint32_t index = 0; index < change->replaced_count; index++)
         deadman_replace(routing->env.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
     timers_change(routing->env.timers, &change->timers);
+    states_adopt(routing->env.timers, change->program->states, change->program->state_count);
     routing->program = change->program;
 }
 

@@ -24,6 +24,7 @@ from router.compiler.expressions.names import (
     no_null,
     presence,
     require_senders,
+    state_named,
     whole_message,
 )
 from router.compiler.expressions.operators import constant
@@ -173,6 +174,8 @@ class _Checker:
                 return lists.list_of([self.check(item, _element(expected)) for item in node.elts], span)
             case ast.Name():
                 return named(node.id, span, self.scope, expected)
+            case ast.Attribute() if state := state_named(node, self.text, self.scope):
+                return state
             case ast.Attribute() if path := constant_path(node, self.scope):
                 return constant_at(path, node, self.text, self.scope)
             case ast.Attribute():
@@ -190,7 +193,7 @@ class _Checker:
                 is_equal = isinstance(node.ops[0], (ast.Eq, ast.Is))
                 raise no_null(self.check(other), ast.unparse(other), span, is_equal=is_equal)
             case ast.Compare():
-                operands = [self.check(operand) for operand in (node.left, *node.comparators)]
+                operands = self._compared([node.left, *node.comparators])
                 require_senders(operands, self.scope)
                 return operators.comparison(node.ops, operands, span, self.scope)
             case ast.IfExp():
@@ -202,6 +205,15 @@ class _Checker:
                 return self._call(node, span, expected)
             case _:
                 raise forbidden(node, span)
+
+    def _compared(self, operands: Sequence[ast.expr]) -> list[Node]:
+        """Check the operands of a comparison. Beside a state with an enum, bare names are values of the enum."""
+        states = [state for each in operands if (state := state_named(each, self.text, self.scope))]
+        enum = next((state.kind.enum for state in states if isinstance(state.kind, EnumKind)), None)
+        if enum is None:
+            return [self.check(operand) for operand in operands]
+        expected: Mapping[type[ast.expr], Type] = {ast.Name: enum, ast.List: List(enum)}
+        return [self.check(operand, expected.get(type(operand))) for operand in operands]
 
     def _beside_null(self, node: ast.Compare) -> ast.expr | None:
         """Return the `x` of `x == null`, `None != x` and `x is None`; None for other comparisons."""

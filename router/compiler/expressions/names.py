@@ -20,12 +20,13 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.expressions.lists import elementwise
 from router.compiler.expressions.operators import constant
-from router.compiler.expressions.scope import ExpressionError, Scope, field_of, require_readable
+from router.compiler.expressions.scope import BrokenStateError, ExpressionError, Scope, field_of, require_readable
 from router.compiler.expressions.syntax import Parsed, dotted
 from router.compiler.expressions.tree import (
     ENVELOPE,
     MESSAGE,
     SOURCE,
+    STATE,
     Constant,
     ListLiteral,
     Node,
@@ -175,6 +176,34 @@ def whole_message(holder: ast.expr, text: Parsed, scope: Scope) -> Node | None:
         return None
     span = text.span(holder)
     return scope.source_message(span) if holder.id == MESSAGE else scope.whole_envelope(span)
+
+
+def state_named(node: ast.expr, text: Parsed, scope: Scope) -> Variable | None:
+    """Return the state that `state.NAME` names; None if it names none, or a field of the message."""
+    if not scope.states or not isinstance(node, ast.Attribute) or STATE in scope.names:
+        return None
+    if not isinstance(node.value, ast.Name) or node.value.id != STATE:
+        return None
+    name, span = node.attr, text.span(node)
+    member = scope.message.field(STATE)
+    inner = member.type if member is not None else None
+    if isinstance(inner, MessageType):
+        if not scope.reads_states or name not in scope.states:
+            return None
+        if inner.field(name) is not None:
+            message = f"'state.{name}' is a field of {scope.message} and a state of the table"
+            hint = f"write message.state.{name} for the field; give the state another name to read it here"
+            raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, message, hint)
+    if name not in scope.states:
+        message = f"there is no state '{name}'"
+        raise ExpressionError(text.last_span(node), Code.UNKNOWN_STATE, message, did_you_mean(name, scope.states))
+    if not scope.reads_states:
+        message, hint = "only conditions can read a state", "read it in `when` of a destination or topic"
+        raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, message, hint)
+    kind = scope.states[name]
+    if kind is None:
+        raise BrokenStateError(span, Code.UNKNOWN_STATE, f"'state.{name}' has a finding")
+    return Variable(kind, span, f"{STATE}.{name}")
 
 
 def is_null(node: ast.expr, scope: Scope) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 
-from router.compiler.expressions.kinds import MessageKind, kind_of
+from router.compiler.expressions.kinds import Kind, MessageKind, kind_of
 from router.compiler.expressions.tree import ENVELOPE, ITEM, MESSAGE, RECEIVED_AT, SOURCE, Node, Read, Variable
 from router.errors import Code, FindingError, SourceSpan
 from router.types.model import Enum, Field, List, MessageType, String
@@ -17,6 +17,10 @@ class ExpressionError(FindingError):
     """The first mistake in an expression."""
 
 
+class BrokenStateError(ExpressionError):
+    """An expression reads a state whose declaration has a finding already."""
+
+
 @dataclass(slots=True)
 class Scope:
     """The names in the expressions of one target.
@@ -24,9 +28,10 @@ class Scope:
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
     additional variables, which take precedence over fields. `given` are those of MESSAGE, SOURCE and RECEIVED_AT that
     are available. `envelope` is that of a message from UDP, which ENVELOPE then names. `sources` are the possible
-    values of SOURCE, empty if they are not known. `absent` are names that a missing key of the route would define, each
-    with message and hint. `element` is the message in a list whose fields are visible instead of those of the source
-    message; `message` is then its type, and `source` the type of the source message.
+    values of SOURCE, empty if they are not known. `states` are the kinds of the table's states, None for one with a
+    finding; only conditions can read them (`reads_states`). `absent` are names that a missing key of the route would
+    define, each with message and hint. `element` is the message in a list whose fields are visible instead of those of
+    the source message; `message` is then its type, and `source` the type of the source message.
     """
 
     message: MessageType
@@ -36,6 +41,8 @@ class Scope:
     given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
     envelope: Envelope | None = None
     sources: Collection[str] = ()
+    states: Mapping[str, Kind | None] = field(default_factory=dict)
+    reads_states: bool = False
     absent: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     element: Node | None = None
     source: MessageType | None = None

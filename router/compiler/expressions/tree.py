@@ -21,6 +21,9 @@ MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 ENVELOPE = "envelope"
 """Likewise for a message from UDP: the message around the payload, without the payload."""
 
+STATE = "state"
+"""In conditions, `state.NAME` is a state of the table: a Variable of this name."""
+
 ITEM, INDEX, COUNT, ITEMS = "item", "index", "count", "items"
 """Variables of `for_each` (the first three) and of `collect` (the last two)."""
 

@@ -5,9 +5,9 @@ Each target is lowered once. A routine that is too large is a finding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from router.compiler.checked import CheckedRoute
+from router.compiler.checked import CheckedRoute, CheckedState
 from router.compiler.expressions.tree import Node
 from router.compiler.lowering.lowered import (
     Lowered,
@@ -16,6 +16,7 @@ from router.compiler.lowering.lowered import (
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
+    LoweredState,
 )
 from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
@@ -29,13 +30,20 @@ __all__ = [
     "LoweredElements",
     "LoweredFeed",
     "LoweredRoute",
+    "LoweredState",
     "lower_condition",
     "lower_table",
 ]
 
 
-def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope | None = None) -> tuple[Lowered, list[Diagnostic]]:
-    """Lower all targets of a table without errors. Return findings for those that are too large."""
+_NO_STATES: Mapping[str, CheckedState] = {}
+
+
+def lower_table(
+    routes: Sequence[CheckedRoute], envelope: Envelope | None = None, states: Mapping[str, CheckedState] = _NO_STATES
+) -> tuple[Lowered, list[Diagnostic]]:
+    """Lower all targets and states of a table without errors. Return findings for those that are too large."""
+    names = tuple(states)
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}
@@ -47,13 +55,15 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope | None = None
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             try:
                 if targets:
-                    lowered[checked.route.name] = Datagram(checked.case, envelope).lowered(checked, targets)
+                    source = Datagram(checked.case, envelope, names)
+                    lowered[checked.route.name] = source.lowered(checked, targets)
             except TooLargeError as error:
                 findings.append(error.diagnostic)
         for feed in checked.subscriptions:
             topic = feed.topic.topic.value
             try:
-                from_ros[topic] = (*from_ros.get(topic, ()), RosMessage(feed.type, topic).lowered(checked, feed))
+                message = RosMessage(feed.type, topic, names)
+                from_ros[topic] = (*from_ros.get(topic, ()), message.lowered(checked, feed))
             except TooLargeError as error:
                 findings.append(error.diagnostic)
         try:
@@ -62,7 +72,20 @@ def lower_table(routes: Sequence[CheckedRoute], envelope: Envelope | None = None
                 obeyed[checked.route.name] = lower_condition(when, case, envelope, is_bounded=True)
         except TooLargeError as error:
             findings.append(error.diagnostic)
-    return Lowered(to_destinations, to_topics, from_ros, obeyed), findings
+    values = _lower_states(states, envelope, findings)
+    return Lowered(to_destinations, to_topics, from_ros, obeyed, values), findings
+
+
+def _lower_states(
+    states: Mapping[str, CheckedState], envelope: Envelope | None, findings: list[Diagnostic]
+) -> Mapping[str, LoweredState]:
+    lowered = {}
+    for name, state in states.items():
+        try:
+            lowered[name] = Datagram(state.case, envelope).state(state)
+        except TooLargeError as error:
+            findings.append(error.diagnostic)
+    return lowered
 
 
 def lower_condition(

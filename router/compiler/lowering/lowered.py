@@ -77,6 +77,15 @@ class LoweredCondition:
 
 
 @dataclass(frozen=True, slots=True)
+class LoweredState:
+    """What computes the value of a state from a payload, and the fields that it reads; `place` is its place."""
+
+    routine: Routine
+    layout: Layout
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
 class LoweredConstant:
     """The routine of a message that reads no other one, with the place of each operation."""
 
@@ -91,10 +100,11 @@ class Lowered:
 
     For datagrams, by route: `to_destinations` has the destinations with a condition, `to_topics` the topics. `from_ros`
     is by topic, in the order of the table. `obeyed` has the conditions that show that a deadman's brake is obeyed, by
-    the deadman's route.
+    the deadman's route. `states` is by name.
     """
 
     to_destinations: Mapping[str, LoweredRoute]
     to_topics: Mapping[str, LoweredRoute]
     from_ros: Mapping[str, tuple[LoweredFeed, ...]]
     obeyed: Mapping[str, LoweredCondition]
+    states: Mapping[str, LoweredState]

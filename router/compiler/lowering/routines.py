@@ -15,10 +15,11 @@ from router.compiler.lowering.operations import Routine
 
 @dataclass(slots=True)
 class Routines:
-    """Makes the routines of one layout. `arrays` owns their memory."""
+    """Makes the routines of one layout. `arrays` owns their memory; `states` are the settings of the table's states."""
 
     _layout: Layout
     arrays: Arrays
+    states: Any = None
     _literals: bytearray = field(default_factory=bytearray)
 
     def routine(self, routine: Routine) -> c.Routine:
@@ -50,6 +51,7 @@ class Routines:
             slot_count=len(layout.defaults),
             is_cdr=layout.is_cdr,
             envelope=layout.envelope,
+            states=self.states,
         )
         return ctypes.pointer(self.arrays.add(native))
 

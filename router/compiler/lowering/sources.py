@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 
 from google.protobuf.descriptor import Descriptor
 
-from router.compiler.checked import CheckedRoute, CheckedSubscription, Target
+from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
 from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import UINT32, StringKind
+from router.compiler.expressions.states import gate_of, states_in
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
@@ -20,6 +21,7 @@ from router.compiler.lowering.lowered import (
     LoweredElements,
     LoweredFeed,
     LoweredRoute,
+    LoweredState,
 )
 from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
@@ -36,17 +38,19 @@ from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
-"""Maximum operations of a destination's `when` per datagram, about a millisecond of the receive thread."""
+"""Maximum operations per datagram of a destination's `when` or a state's value, about a millisecond of the receive
+thread."""
 
 _MOST_SLOTS = NONE
 
 
 @dataclass
 class _Source:
-    """A message that routines read into `root`. `topic` is its source, empty for UDP."""
+    """A message that routines read into `root`. `topic` is its source, empty for UDP; `states` are the table's."""
 
     root: Section
     topic: str = ""
+    states: Sequence[str] = ()
     temporaries: list[Slot] = field(default_factory=list)
     elements: list[Section] = field(default_factory=list)
     variables: dict[str, Meaning] = field(default_factory=dict)
@@ -75,22 +79,31 @@ class _Source:
         given = [condition for condition in conditions if condition is not None]
         if not given:
             return (), ""
-        routine = chained(Op.AND, [lowering.value(condition) for condition in given])
+        read = [self._state(lowering, name) for name in states_in(given)]
+        routine = (*read, *chained(Op.AND, [lowering.value(condition) for condition in given]))
         _require_small([(operation, given[-1].span) for operation in routine])
-        if is_bounded and (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
-            limit = f"the limit for a destination's `when` is {MOST_CONDITION_OPERATIONS:,}"
-            message = f"this could take {most:,} operations on the longest datagram; {limit}"
-            hint = f"a list counts as {MAX_DATAGRAM:,} elements: use fewer lists, or use them less often"
-            raise TooLargeError(given[-1].span, message, hint)
+        if is_bounded:
+            _require_fast(routine, given[-1].span, "a destination's `when`")
         return routine, ", or ".join(f"{condition.span}: when" for condition in given)
+
+    def _state(self, lowering: Lowering, name: str) -> Operation:
+        """Return the operation that reads a state for a condition, which then sees a single value of it."""
+        slot = Slot(0, f"{tree.STATE}.{name}")
+        self.temporaries.append(slot)
+        lowering.names.variables[slot.name] = slot
+        return Operation(Op.STATE, slot, number=self.states.index(name))
+
+    def gate(self, target: Target, conditions: Sequence[tree.Node | None]) -> Routine:
+        """Lower what a message that was held must still meet when it leaves. Raises TooLargeError."""
+        return self.condition(self.lowering(), gate_of(conditions))[0] if target.is_deferred else ()
 
 
 class Datagram(_Source):
     """A payload from UDP, in its envelope unless it is read alone."""
 
-    def __init__(self, case: PayloadCase, envelope: Envelope | None = None) -> None:
+    def __init__(self, case: PayloadCase, envelope: Envelope | None = None, states: Sequence[str] = ()) -> None:
         descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
-        super().__init__(Section(case.type, descriptor))
+        super().__init__(Section(case.type, descriptor), states=states)
         self._envelope: Section | None = None
         if envelope is not None:
             around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
@@ -118,7 +131,14 @@ class Datagram(_Source):
         lowering = self.lowering()
         condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
         message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
-        return replace(target, condition=condition, message=message, places=("", when, place, *places))
+        gate = self.gate(target, [target.when])
+        return replace(target, condition=condition, gate=gate, message=message, places=("", when, place, *places))
+
+    def state(self, state: CheckedState) -> LoweredState:
+        """Lower the value of a state. Raises TooLargeError."""
+        routine, span = self._number(state.value), state.value.span
+        _require_fast(routine, span, "the value of a state")
+        return LoweredState(routine, self.layout(span), f"{span}: state")
 
     def _number(self, node: tree.Node) -> Routine:
         routine = self.lowering().value(node)
@@ -142,8 +162,8 @@ class Datagram(_Source):
 class RosMessage(_Source):
     """A message from a ROS topic."""
 
-    def __init__(self, declared: MessageType, topic: str) -> None:
-        super().__init__(Section(declared, None), topic)
+    def __init__(self, declared: MessageType, topic: str, states: Sequence[str] = ()) -> None:
+        super().__init__(Section(declared, None), topic, states)
 
     def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
         """Lower a route's routines for these messages. Raises TooLargeError."""
@@ -158,7 +178,8 @@ class RosMessage(_Source):
             beside = target.beside.data if target.beside else b""
             message, places = self.sent(lowering, target.plan, checked.case, beside)
             all_places = f"{feed.topic.span}: a malformed message", when, place, *places
-            targets[target.label] = replace(target, condition=condition, message=message, places=all_places)
+            gate = self.gate(target, [feed.when, target.when])
+            targets[target.label] = replace(target, condition=condition, gate=gate, message=message, places=all_places)
         layout = self.layout(feed.topic.span)
         return LoweredFeed(
             checked.route.name,
@@ -268,6 +289,15 @@ def _require_small(placed: Sequence[tuple[Operation, SourceSpan]]) -> None:
         for (_, span), count in zip(placed, counts, strict=True):
             if count > most:
                 raise TooLargeError(span, f"more than {most} {what}", hint)
+
+
+def _require_fast(routine: Routine, span: SourceSpan, what: str) -> None:
+    """Raise TooLargeError if a routine could occupy the receive thread for too long."""
+    if (most := most_executed(routine)) > MOST_CONDITION_OPERATIONS:
+        limit = f"the limit for {what} is {MOST_CONDITION_OPERATIONS:,}"
+        message = f"this could take {most:,} operations on the longest datagram; {limit}"
+        hint = f"a list counts as {MAX_DATAGRAM:,} elements: use fewer lists, or use them less often"
+        raise TooLargeError(span, message, hint)
 
 
 def _small(layout: Layout, span: SourceSpan) -> Layout:

@@ -129,6 +129,20 @@ _KEYS: Schema = {
         "The UDP addresses that messages come from and go to, by the name that routes use.",
         {"default": {}, **_by_name("endpoint", ("any", "ros"))},
     ),
+    "state": key(
+        "States",
+        "Values that messages set and conditions read, such as who drives: `when: state.mode == MODE_AUTO`. By a name "
+        "that appears in metrics.",
+        {
+            "default": {},
+            "type": "object",
+            "propertyNames": {
+                "pattern": "^[A-Za-z][A-Za-z0-9_]*$",
+                "errorMessage": "must begin with a letter and continue with letters, digits and '_'",
+            },
+            "additionalProperties": ref("state"),
+        },
+    ),
     "routes": key(
         "Routes",
         "What happens to each payload case of the envelope, by its name in the proto. Every case has a route, a list "

@@ -8,6 +8,7 @@ from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
 from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
+from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
 _OF_ALL_TOPICS = ("topic", "type", "queue_depth", "qos")
@@ -168,6 +169,7 @@ _DEFAULTS = key("Defaults", "Values for parts of the table that do not set their
 PARTS: Schema = {
     "listener": part(Listener),
     "endpoint": part(Endpoint),
+    "state": part(State),
     "case": _CASE,
     "route": _ROUTE,
     "deadman": {

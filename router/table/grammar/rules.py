@@ -10,6 +10,7 @@ from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Transport, ZenohSettings
 from router.table.model.routes import Collect
 from router.table.model.settings import RecordSettings
+from router.table.model.state import State
 
 
 def without(names: str, message: str) -> Schema:
@@ -60,6 +61,7 @@ COMPLETE: Schema = {
             "foxglove": {"required": ["address"]},
             "listen": _each({"required": required(Listener)}),
             "endpoints": _each({"required": required(Endpoint)}),
+            "state": _each({"required": required(State)}),
             "routes": _each(ref("complete_route")),
             "gateways": _each(ref("complete_gateway")),
         },

@@ -120,6 +120,7 @@ VALUES: Schema = {
         must="be a glob such as '/rover/**', or {regex: ...}",
     ),
     "condition": {"type": ["string", "boolean"], "errorMessage": "must be an expression"},
+    "constant": expression("string", "number", "boolean", must_be="a constant"),
     "part_expression": expression("string", "number", must_be="an expression over the message"),
     "list_expression": expression(
         "string", must_be='an expression that gives a list, such as detections or "[left, right]"'

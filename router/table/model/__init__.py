@@ -17,6 +17,7 @@ from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway
 from router.table.model.routes import Route
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
+from router.table.model.state import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,4 +58,5 @@ class RouteTable:
     foxglove: ServerSettings | None = None
     reload_on_change: bool = False
     networks: Networks | None = None
+    states: Mapping[str, State] = field(default_factory=dict)
     package: Located[str] | None = None

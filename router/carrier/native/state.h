@@ -1,0 +1,50 @@
+/* `state`: named values that messages set and conditions read. The object lasts across reloads, as long as name and type of
+ * the state stay the same; its settings are those of the running program.
+ *
+ * Any thread reads a value without waiting. All changes are made under the lock of the group of timers: a state is one of
+ * its timers, due when its value expires. The environment of the group counts and reports changes. */
+#ifndef STATE_H
+#define STATE_H
+
+#include <stdint.h>
+
+#include "deliver.h"
+#include "timers.h"
+
+struct state;
+
+/* A state as a program declares it. */
+struct state_settings {
+    struct state *state;
+    int64_t initial;
+    int64_t valid_for; /* ns, or NEVER if the value does not expire */
+    uint32_t id;       /* in events */
+    uint32_t value, changes; /* counters */
+    uint32_t reserved;
+};
+
+/* The messages of a route from one sender that set a state. */
+struct setter {
+    struct state *state;
+    /* What reads the fields. Its only target stands for the state: `message` computes the value, and losses are counted there. */
+    struct targets to;
+    uint32_t column; /* of the sender */
+    uint32_t source; /* its name, in events */
+    uint32_t age;    /* counter: boot clock */
+    uint32_t reserved;
+};
+
+/* Open a state that was never set. Its first member is a struct timer. Returns NULL if memory runs out. */
+struct state *state_open(void);
+void state_close(struct state *state);
+
+/* Adopt the settings of a program. Takes the lock. */
+void states_adopt(struct timers *timers, const struct state_settings *settings, uint32_t count);
+
+/* Set the state to the value of a message that arrived at `at` (boot clock). Takes the lock. */
+void state_set(struct timers *timers, const struct setter *setter, int64_t value, int64_t at);
+
+/* The value at `now` (boot clock): of the last message that set it, or the initial one without a valid message. */
+int64_t state_value(const struct state *state, int64_t now);
+
+#endif

@@ -1,0 +1,48 @@
+"""Which states a condition reads, and which part of it reads nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, Variable, parts_of
+
+
+def states_in(conditions: Iterable[Node | None]) -> list[str]:
+    """Return the names of the states that conditions read, each once."""
+    nodes = (node for condition in conditions if condition is not None for node in _nodes(condition))
+    return list(dict.fromkeys(name for node in nodes if (name := _state(node)) is not None))
+
+
+def gate_of(conditions: Iterable[Node | None]) -> list[Node]:
+    """Return the operands of a conjunction that read states, and nothing of the message."""
+    return [each for each in operands_of(conditions) if states_in([each]) and not reads_message(each)]
+
+
+def operands_of(conditions: Iterable[Node | None]) -> Iterator[Node]:
+    """Yield the operands of a conjunction of conditions."""
+    for condition in conditions:
+        if isinstance(condition, Logic) and condition.is_all:
+            yield from operands_of(condition.operands)
+        elif condition is not None:
+            yield condition
+
+
+def _nodes(node: Node) -> Iterator[Node]:
+    yield node
+    for part in parts_of(node):
+        yield from _nodes(part)
+
+
+def _state(node: Node) -> str | None:
+    """Return the name of the state that a node reads, None for other nodes."""
+    if not isinstance(node, Variable) or not node.name.startswith(f"{STATE}."):
+        return None
+    return node.name.removeprefix(f"{STATE}.")
+
+
+def reads_message(node: Node) -> bool:
+    """Return whether a condition depends on the message."""
+    return any(
+        isinstance(each, (Read, Present)) or (isinstance(each, Variable) and _state(each) is None)
+        for each in _nodes(node)
+    )

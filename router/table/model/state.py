@@ -1,0 +1,58 @@
+"""States: named values that messages set and conditions read."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from router.errors import Located, SourceSpan
+from router.table.keys import Listed, Named, Shape
+from router.table.model.expressions import Expression
+from router.table.units import VALIDITY
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A value that messages of a payload case set, and that conditions read as 'state.NAME'.
+
+    `span` is its name in the table. `valid_for` is in ns, 0 for never, None if it is not set.
+
+    Example: {case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}
+    """
+
+    name: str
+    span: SourceSpan
+    case: Located[str]
+    """The payload case whose messages set it. A route takes them, or the state never changes.
+
+    Title: Payload case
+    Example: control_mode
+    """
+    sources: Annotated[tuple[Located[str], ...], Named("source"), Listed(least=1, unique=True, alone=True)]
+    """The endpoint or endpoints whose messages set it.
+
+    Example: basestation
+    """
+    value: Expression
+    """An expression over the message that gives an integer, a bool or an enum. A message for which it has no value, or
+    a number that the enum does not name, leaves the state unchanged and is counted as dropped.
+
+    Example: mode
+    """
+    initial: Annotated[Expression, Shape("constant")]
+    """The value until a message sets it, and again when none has for 'valid_for': a constant, for an enum the name of a
+    value. Write the one that stops the rover.
+
+    Example: MODE_MANUAL
+    """
+    valid_for: Annotated[Located[int] | None, VALIDITY] = None
+    """How long a message counts, from its arrival; the state is then 'initial' again. Required if the condition of a
+    command reads the state. never: until another message comes.
+
+    Example: 5s
+    Example: never
+    """
+    because: Annotated[str | None, Shape("reason")] = None
+    """Why commands may depend on a value of any age. Required with 'valid_for: never' if they do.
+
+    Example: the basestation sends the mode only when it changes
+    Error: must say why
+    """

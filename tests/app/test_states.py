@@ -1,0 +1,78 @@
+"""States in a whole router: a datagram decides which commands from ROS pass, also after reloads; changes are logged."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+from structlog.testing import capture_logs
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from tests.app.conftest import Site
+from tests.ros.peers import Publisher, wait_until
+
+TYPE = "comms/msg/DrivingBoardMotorMessage"
+MANUAL, AUTO = bytes.fromhex("820100"), bytes.fromhex("8201020801")
+PASSES = "state.mode == MODE_AUTO"
+
+
+def table(when: str = PASSES, valid_for: str = "60s") -> str:
+    """The route is in one of two threads: with a `ttl` in the urgent one."""
+    return f"""\
+  control_mode: {{source: sensor_board}}
+  drive_motor:
+    source: {{topic: drive_motor, type: {TYPE}, queue_depth: 1000}}
+    fields: auto
+    destinations: [{{endpoint: basestation, when: "{when}"}}]
+    ttl: 30s
+    deadman: {{none: for this test}}
+state:
+  mode: {{case: control_mode, source: sensor_board, value: mode, initial: MODE_MANUAL, valid_for: {valid_for}}}
+"""
+
+
+def command(number: int) -> bytes:
+    return b"\0\1\0\0" + struct.pack("<ff", number, 1)
+
+
+def number_of(datagram: bytes) -> float:
+    return float(struct.unpack_from("<f", datagram, 3)[0])
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    with closing(Publisher("drive_motor", TYPE)) as made:
+        yield made
+
+
+def test_a_datagram_lets_commands_from_ros_pass(site: Site, publisher: Publisher) -> None:
+    with capture_logs() as logs, site.router(table()) as router:
+        assert publisher.line() == "matched"
+        publisher.publish([command(1)])
+        wait_until(lambda: router.total("messages_filtered") == 1)
+        site.send(AUTO)
+        wait_until(lambda: router.total("state_changes") == 1)
+        publisher.publish([command(2)])
+        assert number_of(site.basestation.recv(1000)) == 2
+        site.write(table(f"{PASSES} and turning_radius > 0"))
+        assert router.reload().ok
+        publisher.publish([command(3)])
+        assert number_of(site.basestation.recv(1000)) == 3  # the reload has kept the state
+        site.send(MANUAL)
+        wait_until(lambda: router.total("state_changes") == 2)
+        publisher.publish([command(4)])
+        wait_until(lambda: router.total("messages_filtered") == 2)
+    told = [(log["before"], log["after"], log["source"]) for log in logs if log["event"] == "state changed"]
+    assert told == [("MODE_MANUAL", "MODE_AUTO", "sensor_board"), ("MODE_AUTO", "MODE_MANUAL", "sensor_board")]
+
+
+def test_a_state_that_expires_is_logged(site: Site) -> None:
+    with capture_logs() as logs, site.router(table(valid_for="200ms")) as router:
+        site.send(AUTO)
+        wait_until(lambda: router.total("state_changes") == 2)
+    [told] = [log for log in logs if log["event"] == "state is back at its initial value"]
+    assert (told["state"], told["before"], told["after"]) == ("mode", "MODE_AUTO", "MODE_MANUAL")
+    assert told["log_level"] == "warning"

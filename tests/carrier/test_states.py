@@ -1,0 +1,136 @@
+"""States outlast reloads, but not restarts; threads that read one get a value that belongs to its time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.carrier.events import CountedReport, StateChange
+from router.carrier.simulation import Simulation
+from router.compiler.compiled_table import CompiledTable
+from router.library import library
+from tests.carrier.building import RACES, run_program
+from tests.small_tables import BASESTATION, HEAD, MS, SECOND, enveloped, program
+
+ROUTE = "  control_mode: {source: basestation}\n"
+MODE = "mode: {case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}"
+MANUAL, AUTO = 0, 1
+
+
+class States:
+    """A run of a table with one state; `changes` are those since the last call of `run`."""
+
+    def __init__(self, folder: Path, state: str = MODE) -> None:
+        self.folder = folder
+        self.compiled = self._program(state)
+        self.simulation = Simulation(library(), 10**12)
+        self.simulation.adopt(self.compiled)
+
+    def _program(self, state: str) -> CompiledTable:
+        return program(self.folder, f"{ROUTE}state:\n  {state}\n", HEAD)
+
+    def set(self, mode: int) -> None:
+        data = enveloped(control_mode={"mode": mode})
+        self.simulation.datagram("exact", BASESTATION, data, self.simulation.now)
+
+    def reload(self, state: str) -> None:
+        self.compiled = self._program(state)
+        self.simulation.adopt(self.compiled)
+
+    def changes(self, after: int = 0) -> list[StateChange]:
+        self.simulation.advance(self.simulation.now + after)
+        return [each for each in self.simulation.records() if isinstance(each, StateChange)]
+
+    def count(self, metric: str, *labels: str) -> int:
+        index = self.compiled.counters.index(metric, "mode", *labels)
+        return self.simulation.counters(index + 1)[index]
+
+
+def test_changes_are_reported_and_counted(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    assert states.count("state") == MANUAL
+    states.set(AUTO)
+    states.set(AUTO)
+    assert states.changes() == [StateChange("mode", MANUAL, AUTO, "basestation")]
+    assert states.count("state") == AUTO
+    assert states.count("state_set_seconds", "basestation") == states.simulation.now
+    assert states.changes(5 * SECOND) == []
+    assert states.changes(1) == [StateChange("mode", AUTO, MANUAL, None)]
+    assert states.count("state") == MANUAL
+    assert states.count("state_changes") == 2
+
+
+def test_a_message_without_a_value_is_reported_with_its_place(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.set(7)
+    [report] = [each.report for each in states.simulation.records() if isinstance(each, CountedReport)]
+    assert (report.place, report.target, report.reason) == ("control_mode", "state.mode", "mapping_error")
+    assert report.detail.endswith(": state: the enum has no value 7")
+    assert f"{tmp_path / 'table.yaml'}:" in report.detail
+
+
+def test_a_reload_keeps_a_state_by_name_and_type(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.set(AUTO)
+    states.changes(SECOND)
+    states.reload(MODE.replace("MODE_MANUAL", "MODE_AUTO").replace("5s", "3s"))
+    assert states.changes() == []
+    assert states.count("state") == AUTO
+    states.reload(MODE.replace("5s", "2s"))
+    assert states.changes(SECOND) == []
+    assert states.changes(1) == [StateChange("mode", AUTO, MANUAL, None)]  # with the time of the running table
+
+
+def test_a_reload_applies_another_initial_value(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.reload(MODE.replace("MODE_MANUAL", "MODE_AUTO"))
+    assert states.changes() == [StateChange("mode", MANUAL, AUTO, None)]
+
+
+def test_a_state_of_another_type_begins_anew(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.set(AUTO)
+    states.reload("mode: {case: control_mode, source: basestation, value: int(mode), initial: 5, valid_for: 5s}")
+    assert states.count("state") == 5
+    states.reload(MODE)
+    assert states.count("state") == MANUAL
+
+
+def test_a_reload_can_remove_a_state_that_would_expire(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.set(AUTO)
+    states.changes()
+    states.reload("other: {case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL}")
+    states.reload("other: {case: control_mode, source: basestation, value: mode, initial: MODE_AUTO}")
+    assert states.changes(10 * SECOND) == [StateChange("other", MANUAL, AUTO, None)]
+
+
+def test_a_restart_begins_with_the_initial_value(tmp_path: Path) -> None:
+    states = States(tmp_path)
+    states.set(AUTO)
+    states.changes()
+    states.simulation.restart(10**12)
+    assert states.changes(6 * SECOND) == []
+    assert states.count("state") == MANUAL
+
+
+def test_a_value_that_never_expires_stays(tmp_path: Path) -> None:
+    states = States(tmp_path, MODE.replace("5s", "never"))
+    states.set(AUTO)
+    states.changes()
+    assert states.changes(10**6 * SECOND) == []
+    assert states.count("state") == AUTO
+
+
+def test_a_negative_value_is_counted_as_such(tmp_path: Path) -> None:
+    states = States(tmp_path, "mode: {case: control_mode, source: basestation, value: -int(mode), initial: -3}")
+    assert states.count("state") == -3
+    states.set(AUTO)
+    assert states.changes(MS) == [StateChange("mode", -3, -1, "basestation")]
+    assert states.count("state") == -1
+
+
+@pytest.mark.parametrize("sanitizers", ["", pytest.param(RACES, marks=pytest.mark.slow)])
+def test_readers_get_a_value_with_its_own_time(tmp_path: Path, sanitizers: str) -> None:
+    run_program("states", tmp_path, 20_000 if sanitizers else 200_000, sanitizers=sanitizers)
