@@ -7,7 +7,6 @@
 #include "defer.h"
 #include "envelope.h"
 #include "evaluate.h"
-#include "state.h"
 
 /* One message on its way to one target. */
 struct delivery {
@@ -286,10 +285,6 @@ static int brake_by_socket(struct thread_env *env, const struct deadman_destinat
     return sender_send_checked(to->sender, datagram->data, datagram->size);
 }
 
-static int64_t present_state(struct thread_env *env, const struct state_settings *of) {
-    return state_value(of->state, env->now(env));
-}
-
 bool env_open(struct thread_env *env, counter *counters, struct ring *events, struct timers *timers) {
     memset(env, 0, sizeof *env);
     env->counters = counters;
@@ -297,7 +292,6 @@ bool env_open(struct thread_env *env, counter *counters, struct ring *events, st
     env->timers = timers;
     env->now = clock_now;
     env->wall = clock_wall;
-    env->state = present_state;
     env->send = send_by_socket;
     env->brake = brake_by_socket;
     if (!machine_open(&env->machine)) return false;

@@ -139,8 +139,6 @@ struct thread_env {
     /* The boot clock and the wall clock, ns. */
     int64_t (*now)(struct thread_env *env);
     int64_t (*wall)(struct thread_env *env);
-    /* The present value of a state. */
-    int64_t (*state)(struct thread_env *env, const struct state_settings *of);
     /* Send as `command_send` does. The caller has just checked the age. */
     int (*send)(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires);
     /* Send a datagram of a deadman, with the lock held. Return 0, an errno, or BRAKE_LATER: see `deadman_settle`. */

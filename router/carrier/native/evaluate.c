@@ -6,7 +6,7 @@
 #include "deliver.h"
 #include "events.h"
 #include "lists.h"
-#include "state.h"
+#include "state_value.h"
 #include "texts.h"
 #include "utf8.h"
 #include "write_cdr.h"
@@ -15,7 +15,7 @@
 /* ---- states ---- */
 
 static int64_t present_state(const struct machine *machine, int64_t index) {
-    return machine->env->state(machine->env, &machine->layout->states[index]);
+    return state_value(machine->layout->states[index].state, machine->env->now(machine->env));
 }
 
 /* ---- lists ---- */

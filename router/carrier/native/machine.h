@@ -30,7 +30,7 @@ struct thread_env;
 
 struct machine {
     const struct layout *layout;
-    struct thread_env *env; /* which has the values of states; NULL if no routine reads one */
+    struct thread_env *env; /* its clock decides whether states have expired; NULL if no routine reads one */
     struct value *slots;
     struct cell *cells; /* its address changes when it grows */
     uint32_t cell_count, cell_capacity;

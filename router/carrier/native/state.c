@@ -2,46 +2,7 @@
 
 #include <stdlib.h>
 
-/* Messages are kept in turn in two places, so readers never wait for a writer, which may have a lower priority: the place of
- * message number `count` is not written before message `count + 1` is complete. */
-struct state {
-    struct timer timer; /* first */
-    _Atomic int64_t initial, valid_for;
-    _Atomic uint64_t count; /* of messages that set it */
-    struct {
-        _Atomic int64_t value, at;
-    } set[2];
-    /* For the holder of the lock: */
-    struct state_settings settings;
-    int64_t announced; /* the value that was reported last */
-};
-
-/* ---- reading ---- */
-
-static int64_t relaxed(const _Atomic int64_t *from) { return atomic_load_explicit(from, memory_order_relaxed); }
-
-/* The number of messages that set the state, and the last one. */
-static uint64_t last_set(const struct state *state, int64_t *value, int64_t *at) {
-    for (;;) {
-        uint64_t count = atomic_load_explicit(&state->count, memory_order_acquire);
-        *value = relaxed(&state->set[count % 2].value);
-        *at = relaxed(&state->set[count % 2].at);
-        atomic_thread_fence(memory_order_acquire);
-        if (atomic_load_explicit(&state->count, memory_order_relaxed) == count) return count;
-    }
-}
-
-/* The last time at which a value that was set at `at` is valid. */
-static int64_t valid_until(const struct state *state, int64_t at) {
-    int64_t until;
-    return __builtin_add_overflow(at, relaxed(&state->valid_for), &until) ? NEVER : until;
-}
-
-int64_t state_value(const struct state *state, int64_t now) {
-    int64_t value, at;
-    uint64_t count = last_set(state, &value, &at);
-    return count && now <= valid_until(state, at) ? value : relaxed(&state->initial);
-}
+#include "state_value.h"
 
 /* ---- with the lock held ---- */
 
@@ -60,7 +21,7 @@ static void announce(struct timers *timers, struct state *state, int64_t now, ui
 /* Determine when the value expires. */
 static void await_expiry(struct timers *timers, struct state *state) {
     int64_t value, at, due = NEVER;
-    if (last_set(state, &value, &at)) due = valid_until(state, at);
+    if (state_last_set(state, &value, &at)) due = state_valid_until(state, at);
     timer_set_due(timers, &state->timer, due == NEVER ? NEVER : due + 1);
 }
 

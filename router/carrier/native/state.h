@@ -44,7 +44,4 @@ void states_adopt(struct timers *timers, const struct state_settings *settings, 
 /* Set the state to the value of a message that arrived at `at` (boot clock). Takes the lock. */
 void state_set(struct timers *timers, const struct setter *setter, int64_t value, int64_t at);
 
-/* The value at `now` (boot clock): of the last message that set it, or the initial one without a valid message. */
-int64_t state_value(const struct state *state, int64_t now);
-
 #endif
