@@ -133,6 +133,11 @@ def _manual_brake(now: Pose, noise: Noise) -> Values:
     return {"brake": False}
 
 
+def _control_mode(now: Pose, noise: Noise) -> Values:
+    """Always autonomous, so that a table that asks for it lets commands of the software pass."""
+    return {"mode": 1}
+
+
 def _timestamp(now: Pose, noise: Noise) -> Values:
     return _seconds(now.epoch + now.t)
 
@@ -163,6 +168,7 @@ MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "MotorInformation": _motor,
     "BasestationManualDrive": _manual_drive,
     "BasestationManualBrake": _manual_brake,
+    "BasestationControlMode": _control_mode,
     "google.protobuf.Timestamp": _timestamp,
     "google.protobuf.Duration": _duration,
     "google.protobuf.Any": _any,

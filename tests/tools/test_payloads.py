@@ -13,6 +13,7 @@ from tests import everything
 from tests.tables import PROTOS
 
 EPOCH = 1_700_000_000.0
+MODE_AUTO = 1
 
 
 def test_speed_heading_and_turn_rate_belong_to_the_walked_path() -> None:
@@ -85,3 +86,8 @@ def test_sensors_are_healthy_wherever_they_are(rover: Wire) -> None:
 
 def test_gps_time_is_the_wall_clock_in_milliseconds(rover: Wire) -> None:
     assert sequence(rover.case("gps_info"), seed=1, times=(2.5,))[0].utc_timestamp == 1_700_000_002_500
+
+
+def test_the_operator_leaves_the_rover_to_itself(rover: Wire) -> None:
+    for message in sequence(rover.case("control_mode"), seed=1, times=tuple(map(float, range(60)))):
+        assert message.mode == MODE_AUTO
