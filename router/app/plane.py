@@ -195,7 +195,10 @@ class Plane:
         assert image is not None  # noqa: S101 - prepared
         assert routes is not None  # noqa: S101 - prepared
         assert sockets is not None  # noqa: S101 - prepared
+        explained = self._programs
+        self._programs = {**explained, image.generation: change.program}  # events of its threads come at once
         with ExitStack() as undo:
+            undo.callback(setattr, self, "_programs", explained)
             for thread in self._from_ros:
                 thread.hand_over(routes)
                 undo.callback(thread.take_back)
@@ -218,7 +221,8 @@ class Plane:
             thread.follow(other)
             thread.adopt(routes)
         self.now, self._head_start = Running(change.program, image), None
-        self._programs = {**(self._programs if change.is_first else {}), image.generation: change.program}
+        if not change.is_first:
+            self._programs = {image.generation: change.program}
 
     def wait_until_adopted(self) -> bool:
         """Wait until nothing of an earlier image is in use. Return False if that takes longer than a second."""

@@ -12,6 +12,7 @@ from structlog.testing import capture_logs
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from tests.app.conftest import Site
+from tests.repeating import repeating
 from tests.ros.peers import Publisher, wait_until
 
 TYPE = "comms/msg/DrivingBoardMotorMessage"
@@ -76,3 +77,10 @@ def test_a_state_that_expires_is_logged(site: Site) -> None:
     [told] = [log for log in logs if log["event"] == "state is back at its initial value"]
     assert (told["state"], told["before"], told["after"]) == ("mode", "MODE_AUTO", "MODE_MANUAL")
     assert told["log_level"] == "warning"
+
+
+def test_a_change_by_a_datagram_that_waited_for_the_start_is_logged_in_words(site: Site) -> None:
+    with capture_logs() as logs, repeating(lambda: site.send(AUTO)), site.router(table()) as router:
+        wait_until(lambda: router.total("state_changes") == 1)
+    [told] = [log for log in logs if log["event"] == "state changed"]
+    assert (told["before"], told["after"]) == ("MODE_MANUAL", "MODE_AUTO")
