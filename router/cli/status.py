@@ -5,11 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
 from router.cli.findings import wrapped
 from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError, plural
+
+if TYPE_CHECKING:
+    from router.observe.states import StateReading
 
 DEGRADED = 3
 
@@ -27,7 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
     examples = ("router status", "router status --json", _UNTIL_IT_RUNS)
     parser = add_verb(subparsers, "status", _DESCRIPTION, *examples)
     add_router_options(parser)
-    parser.add_argument("--json", action="store_true", help="a JSON object: state, url, problems, received")
+    parser.add_argument("--json", action="store_true", help="a JSON object: state, url, problems, states, received")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,16 +41,18 @@ def run(args: argparse.Namespace) -> int:
 
     url = running_url(args)
     received = None
+    states: Sequence[StateReading] = ()
     try:
-        *_, received, problems = answer = health(url)
+        *_, received, states, problems = answer = health(url)
         state, code = ("degraded", DEGRADED) if answer.is_degraded else ("running", OK)
     except TransportError as error:
         state, code, problems = "down", NETWORK_FAULT, (down(url, error),)
     if args.json:
         listed = [problem.json() for problem in problems]
-        print(json.dumps({"state": state, "url": url, "problems": listed, "received": received}))
+        shown = [asdict(each) for each in states]
+        print(json.dumps({"state": state, "url": url, "problems": listed, "states": shown, "received": received}))
     else:
-        details = [problem.text for problem in problems]
+        details = [*(problem.text for problem in problems), *(f"{each.name} is {each.value}" for each in states)]
         if received is not None:
             details.append(f"{plural(received, 'datagram')} received")
         print(wrapped(f"{state}: {'; '.join(details)}", sys.stdout))

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
-the time since the last one, and the latency, median (p50) and 99th percentile (p99). Problems, and when each endpoint
-was last heard, come first. `!` marks what is wrong now; `+2` means that two targets do not fit. Without drops there is
-a `-`, or `none accepted` where a deadman sends because the route accepts no command. On a terminal the display is live;
-keys sort and scroll it."""
+the time since the last one, and the latency, median (p50) and 99th percentile (p99). Problems, the values of states,
+and when each endpoint was last heard, come first. `!` marks what is wrong now; `+2` means that two targets do not fit.
+Without drops there is a `-`, or `none accepted` where a deadman sends because the route accepts no command. On a
+terminal the display is live; keys sort and scroll it."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -84,7 +84,7 @@ def _look(url: str, interval: float) -> tuple[View, str]:
     before = metrics(url)
     time.sleep(interval)
     after, state = metrics(url), health(url)
-    return view(before, after, state.problems), state.name
+    return view(before, after, state.problems, state.states), state.name
 
 
 def _title(table: str, url: str) -> str:
@@ -122,7 +122,7 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            seen = view(*window.ends, state.problems)
+            seen = view(*window.ends, state.problems, state.states)
             shown = Screen(seen, _title(state.name, url), order, console.height, note, first)
             live.update(shown, refresh=True)
             try:

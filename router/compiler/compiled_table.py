@@ -150,7 +150,8 @@ class DeadmanPlan:
 class StatePlan:
     """A state: an integer, also for a bool or an enum. `valid_for` is in ns, None for never.
 
-    `setters` are the routes whose messages set it, each with the senders that do. `place` computes the value.
+    `setters` are the routes whose messages set it, each with the senders that do; `readers` are those with conditions
+    that read it. `place` computes the value.
     """
 
     name: str
@@ -158,6 +159,7 @@ class StatePlan:
     initial: int
     valid_for: int | None
     setters: Mapping[str, Collection[str]]
+    readers: Collection[str]
     place: str
 
     @property

@@ -14,6 +14,7 @@ from router.compiler.lookup import definitions_of
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
 from router.compiler.series import open_series
+from router.compiler.states import states_read
 from router.compiler.topics import qos_of
 from router.table.model import RouteTable
 from router.table.model.routes import ANY, Route
@@ -57,13 +58,18 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         lowered=lowered,
         boards=checked.boards,
         gateways=tuple(checked.gateways),
-        states=tuple(_state(state, lowered, inbound) for state in checked.states.values()),
+        states=tuple(_state(state, lowered, inbound, served) for state in checked.states.values()),
     )
     open_series(program)
     return program
 
 
-def _state(state: CheckedState, lowered: Lowered, inbound: Mapping[int, Iterable[RoutePlan]]) -> StatePlan:
+def _state(
+    state: CheckedState,
+    lowered: Lowered,
+    inbound: Mapping[int, Iterable[RoutePlan]],
+    served: Iterable[CheckedRoute],
+) -> StatePlan:
     declared = state.declared
     names = {source.value for source in declared.sources}
     taken = {plan.route: names & plan.sources for plan in inbound.get(state.case.number, ())}
@@ -73,6 +79,7 @@ def _state(state: CheckedState, lowered: Lowered, inbound: Mapping[int, Iterable
         state.initial,
         (declared.valid_for.value or None) if declared.valid_for else None,
         {route: sources for route, sources in taken.items() if sources},
+        [each.route.name for each in served if declared.name in states_read(each)],
         lowered.states[declared.name].place,
     )
 

@@ -95,6 +95,11 @@ def _initial(lookup: Lookup, declared: State, kind: Kind) -> int | None:
 # conditions
 
 
+def states_read(checked: CheckedRoute) -> set[str]:
+    """Return the names of the states that the conditions of a route read."""
+    return {name for _, conditions in _with_conditions(checked) for name in states_in(conditions)}
+
+
 def condition_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Diagnostic]:
     """Yield findings for conditions that read states, and for states that commands depend on."""
     states = lookup.table.states

@@ -33,6 +33,7 @@ from router.observe.obedience import Replies, why_disobeyed
 from router.observe.problems import DROPS, Kind, Problem
 from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
+from router.observe.states import StateReading, state_readings
 from router.table.model.endpoints import EndpointKind
 from router.table.model.routes import ANY
 from router.values.printing import age_text
@@ -125,6 +126,7 @@ _OTHER_ADDRESS = (
     "`router tap --only rejected` shows what it sends."
 )
 _FROM_TOPIC = "Have it send what a route accepts, or write a route for {payload_case} with this `source`."
+_WITHHELD = "They do not meet a condition (`when`) of the table: `router explain {route}` shows it."
 _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
@@ -173,6 +175,10 @@ class HealthSnapshot:
 
     def was_heard(self, endpoint: str) -> bool:
         return (endpoint,) in self.now.counts(Kind.ENDPOINT_SILENT.metric)
+
+    @cached_property
+    def states(self) -> tuple[StateReading, ...]:
+        return tuple(state_readings(self.program, self.now))
 
     @cached_property
     def problems(self) -> tuple[Problem, ...]:
@@ -339,7 +345,16 @@ class HealthSnapshot:
                 if target in self._stale and reason in UNSENT_REASONS:
                     return f", and {target} does not answer", self._remedy_for_silence(target)
                 return f", and {count} for {target} were dropped: {reason}", self._remedy_for_loss(reason, of, target)
+        withheld = sorted(self.grown("messages_filtered"), key=lambda found: -found[1])
+        for (of, target), count in withheld:
+            if of == self._owner(route) and self._are_commands(of, target):
+                return f", and {count} for {target} were withheld{self._read_by(of)}", _WITHHELD.format(route=of)
         return "", ""
+
+    def _read_by(self, route: str) -> str:
+        """Return the present values of the states that conditions of a route read, in words."""
+        read = {state.name for state in self.program.states if route in state.readers}
+        return "".join(f", {state.name} is {state.value}" for state in self.states if state.name in read)
 
     def _stopped(self, route: str) -> Iterator[tuple[str, float]]:
         """Yield the boards that have obeyed the deadman of a route, with their stopping times in seconds."""

@@ -12,6 +12,7 @@ from router.observe.last_values import LastValues
 from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot
+from router.observe.states import StateReading, state_readings
 from router.observe.watch import Health
 from router.table.model.gateways import Transport
 
@@ -80,7 +81,8 @@ class Status:
             "started": self._started,
             "map": table.sha256,
             "ready": running.is_ready,
-            **numbers(running.read(now)),
+            **numbers(reading := running.read(now)),
+            "states": [_state_json(state) for state in state_readings(program, reading)],
             "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }
@@ -96,6 +98,7 @@ class Status:
             "name": health.program.table.path.name,
             "table": health.program.table.sha256,
             "received": health.now.total("datagrams_received"),
+            "states": [asdict(state) for state in health.states],
             "problems": [problem.json() for problem in health.problems],
         }
 
@@ -142,6 +145,10 @@ def numbers(now: Snapshot) -> Json:
             target.setdefault("delivered", 0)
             target.setdefault("dropped", {})
     return found
+
+
+def _state_json(state: StateReading) -> Json:
+    return {"name": state.name, "value": state.value, "origin": state.origin}
 
 
 def _steps(metric: str, path: str) -> tuple[str | int, ...]:

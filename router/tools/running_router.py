@@ -16,6 +16,7 @@ from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
 from router.observe.problems import Kind, Problem
+from router.observe.states import StateReading
 
 if TYPE_CHECKING:
     from router.observe.snapshot import Snapshot
@@ -38,11 +39,15 @@ class Answer(NamedTuple):
 
 
 class Health(NamedTuple):
-    """What is wrong with a router, which table it runs (file name and SHA-256), and the datagrams it has received."""
+    """What is wrong with a router, which table it runs (file name and SHA-256), and the datagrams it has received.
+
+    `states` are those of the table.
+    """
 
     name: str
     table_sha256: str
     received: int
+    states: tuple[StateReading, ...]
     problems: tuple[Problem, ...]
 
     @property
@@ -99,7 +104,9 @@ def health(url: str) -> Health:
     text, _ = _got(url, "/health.json")
     try:
         answer = json.loads(text)
-        return Health(answer["name"], answer["table"], answer["received"], tuple(map(Problem.of, answer["problems"])))
+        states = tuple(StateReading(**state) for state in answer["states"])
+        problems = tuple(map(Problem.of, answer["problems"]))
+        return Health(answer["name"], answer["table"], answer["received"], states, problems)
     except (ValueError, LookupError, TypeError) as error:
         raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 

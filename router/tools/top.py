@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from router.compiler.metrics import INTENDED_REASONS
 from router.observe.problems import DROPS, Kind, Level, Problem
 from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
+from router.observe.states import StateReading
 
 WINDOW = 4.0
 """Seconds over which rates and latencies are computed, as on the status page.
@@ -106,6 +107,7 @@ class View:
     silent: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     calm: tuple[str, ...] = ()
+    states: tuple[StateReading, ...] = ()
 
 
 class Window:
@@ -139,7 +141,9 @@ def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
     )
 
 
-def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = ()) -> View:
+def view(
+    before: Snapshot, after: Snapshot, problems: Sequence[Problem] = (), states: Sequence[StateReading] = ()
+) -> View:
     """Return totals and ages as of `after`, rates per second and latencies since `before`, routes as in the metrics."""
     routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
     rejected: dict[str, int] = defaultdict(int)
@@ -159,6 +163,7 @@ def view(before: Snapshot, after: Snapshot, problems: Sequence[Problem] = ()) ->
         silent=tuple(name for name in silence if _has(problems, Kind.ENDPOINT_SILENT, endpoint=name)),
         problems=tuple(problem.text for problem in problems if problem.kind.level is not Level.CALM),
         calm=tuple(problem.text for problem in problems if problem.kind.level is Level.CALM),
+        states=tuple(states),
     )
 
 

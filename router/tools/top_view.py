@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from router.compiler.metrics import INTENDED_REASONS, LATENCY_BOUNDS_NS
+from router.observe.states import StateReading
 from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered, unwanted
 from router.values.printing import age_text, rate_text, shortened
@@ -127,7 +128,7 @@ class Page:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(self.title, style="bold", no_wrap=True, overflow="ellipsis")
-        yield from _summary(self.view, options.max_width, sys.maxsize, len(self.view.silence))
+        yield from _summary(self.view, options.max_width, sys.maxsize, sys.maxsize)
         yield RouteTable(self.view, self.order, len(self.view.routes) + 1)
 
 
@@ -151,7 +152,7 @@ def _summary(view: View, width: int, problem_lines: int, endpoint_lines: int) ->
     totals = [whole] if len(whole) <= width else [flow, losses]
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
     lines += _problems(view, width, problem_lines)
-    return [*lines, *_last_heard(view, width, endpoint_lines)]
+    return [*lines, *_states(view, width, endpoint_lines), *_last_heard(view, width, endpoint_lines)]
 
 
 def _problems(view: View, width: int, most: int) -> list[Text]:
@@ -170,10 +171,21 @@ def _problems(view: View, width: int, most: int) -> list[Text]:
     return [Text(line, style=_STYLES[sign], no_wrap=True, overflow="ellipsis") for _, sign, line in lines]
 
 
+def _states(view: View, width: int, most: int) -> list[Text]:
+    return _columns("state", [_state(each) for each in view.states], width, most)
+
+
+def _state(state: StateReading) -> Text:
+    return Text.assemble(f"{state.name} ", (state.value, "cyan"), (f", {state.origin}", "dim"))
+
+
 def _last_heard(view: View, width: int, most: int) -> list[Text]:
-    """Return the endpoints below each other, in as many lines as they need; those that do not fit are counted."""
-    title, gap = "last heard  ", "  "
-    items = [_heard(name, age, name in view.silent) for name, age in view.silence.items()]
+    return _columns("last heard", [_heard(*each, each[0] in view.silent) for each in view.silence.items()], width, most)
+
+
+def _columns(title: str, items: list[Text], width: int, most: int) -> list[Text]:
+    """Return items below each other, in as many lines as they need; those that do not fit are counted."""
+    title, gap = f"{title:<12}", "  "
     longest = max(map(len, items), default=0)
     columns = max((width - len(title) + len(gap)) // (longest + len(gap)), 1)
     if (hidden := len(items) - columns * most) > 0:

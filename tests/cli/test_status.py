@@ -10,6 +10,7 @@ import pytest
 from router.cli import NETWORK_FAULT, OK, main
 from router.cli.status import DEGRADED
 from router.observe.problems import Kind, Problem
+from router.observe.states import StateReading
 from tests.tools.answering import answering
 
 SILENT = Problem(Kind.ENDPOINT_SILENT, {"endpoint": "arm_board"}, ": last heard 8 s ago", "Check power and cable.")
@@ -55,6 +56,16 @@ def test_scripts_get_the_kind_of_each_problem_and_where_to_read_on(capsys: pytes
     assert (said["state"], said["received"]) == ("degraded", 7)
     assert (found["kind"], found["level"], found["words"]) == ("EndpointSilent", "warning", "arm_board is silent")
     assert found["page"] == "docs/troubleshooting/alerts.md#endpointsilent"
+
+
+def test_the_line_has_the_states_of_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    mode = StateReading("mode", "MODE_AUTO", "basestation", 0.5, is_valid=True)
+    with answering("", states=[mode]) as url:
+        assert main(["status", "--url", url]) == OK
+        assert capsys.readouterr().out == "running: mode is MODE_AUTO; 7 datagrams received\n"
+        assert main(["status", "--url", url, "--json"]) == OK
+    [state] = json.loads(capsys.readouterr().out)["states"]
+    assert state == {"name": "mode", "value": "MODE_AUTO", "setter": "basestation", "age": 0.5, "is_valid": True}
 
 
 def test_something_else_at_the_address_is_no_router(capsys: pytest.CaptureFixture[str]) -> None:

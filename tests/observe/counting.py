@@ -18,6 +18,8 @@ endpoints:
   arm_board: {{stale_after: never}}
 routes:
   ph_info: {{source: [sensor_board, arm_board]}}
+  drive_motor:
+    source: {{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage, when: state.mode == MODE_AUTO}}
   manual_drive: {{deadman: {{obeyed: {{drive_diag: abs(front_left_motor.rpm) < 5, within: 2s}}}}}}
 state:
   mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}

@@ -14,6 +14,7 @@ from router.observe import watch
 from router.observe.health import PERIOD, REMEDIES, WINDOW
 from router.observe.obedience import Reply
 from router.observe.problems import PAGE, Kind, Level, Problem
+from router.observe.states import StateReading
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
 from tests.observe.counting import Counting
@@ -471,6 +472,28 @@ def test_an_operator_who_comes_back_with_another_address_is_named_after_any_time
     assert found[Kind.ENDPOINT_SILENT].more.endswith("ago, while 192.168.0.77 sends its messages")
     for kind in (Kind.DEADMAN_ACTIVE, Kind.ENDPOINT_SILENT):
         assert found[kind].remedy.startswith("If 192.168.0.77 is basestation, give it the address 192.168.0.10")
+
+
+def test_commands_that_a_state_withholds_are_told_as_the_cause_of_the_stop(router: Counting) -> None:
+    router.count("deadman_active", "drive_motor", to=1)
+    router.count("messages_filtered", "drive_motor", "driving_board", to=9)
+    [stopped] = router.look(1).problems
+    assert stopped.more == ", and 9 for driving_board were withheld, mode is MODE_MANUAL"
+    assert stopped.remedy.endswith("`router explain drive_motor` shows it.")
+    router.count("deadman_active", "manual_drive", to=1)
+    router.count("messages_filtered", "manual_drive", "driving_board", to=2)
+    [other] = [each for each in router.look(1).problems if each.labels["route"] == "manual_drive"]
+    assert other.more == ", and 2 for driving_board were withheld"
+
+
+def test_a_state_has_its_value_and_who_set_it_how_long_ago(router: Counting) -> None:
+    assert router.look(1).states == (StateReading("mode", "MODE_MANUAL", None, None, is_valid=False),)
+    router.count("state", "mode", to=1)
+    router.count("state_set_seconds", "mode", "basestation", to=router.now)
+    assert router.look(5).states == (StateReading("mode", "MODE_AUTO", "basestation", 5.0, is_valid=True),)
+    router.count("state", "mode", to=0)
+    [expired] = router.look(1).states
+    assert (expired.value, expired.origin) == ("MODE_MANUAL", "last set 6.0 s ago by basestation")
 
 
 def test_commands_that_are_dropped_are_told_as_the_cause_of_the_stop(router: Counting) -> None:

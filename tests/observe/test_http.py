@@ -125,7 +125,13 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
     running.count("config_last_reload_successful", to=1)
     running.count("datagrams_received", "rover", to=7)
     sound = ask(server, "/health.json").json
-    assert sound == {"name": "sim.yaml", "table": running.program.table.sha256, "received": 7, "problems": []}
+    assert sound == {
+        "name": "sim.yaml",
+        "table": running.program.table.sha256,
+        "received": 7,
+        "states": [],
+        "problems": [],
+    }
     running.count("deadman_active", "manual_drive", to=1)
     [problem] = ask(server, "/health.json").json["problems"]
     assert (problem["kind"], problem["level"]) == ("DeadmanActive", "warning")

@@ -20,6 +20,7 @@ from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
 from tests.gateway.browser import Browser, Page
 from tests.observe.fake_running import FakeHealth, FakeRunning, served, sim_program
+from tests.tables import ROUTES
 
 pytestmark = pytest.mark.slow
 
@@ -783,6 +784,39 @@ def test_the_page_is_accessible_at_every_size_in_the_light_and_in_the_dark(
             found += [f"{size} {theme} {fault}" for fault in faults]
     assert found == []
     page.close()
+
+
+STATES = f"""\
+version: 1
+extends: {ROUTES}/sim.yaml
+state:
+  mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}
+  selected: {{case: object_selection, source: basestation, value: object_id, initial: 0}}
+"""
+
+
+def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tmp_path: Path) -> None:
+    table = tmp_path / "states.yaml"
+    table.write_text(STATES)
+    program = check_table(table).program
+    assert program is not None
+    running = FakeRunning(program)
+    running.count("state", "mode", to=1)
+    running.count("state_set_seconds", "mode", "basestation", to=boottime_ns())
+    with closing(served(running, save)) as server:
+        page = open_page(browser, f"http://{server.address}/")
+        tiles = page.evaluate("[...document.querySelectorAll('#tiles .state')].map((tile) => tile.textContent)")
+        found = []
+        for size in (*SIZES, (320, 568)):
+            accessibility.show_at(page, size)
+            found += accessibility.problems(page) + accessibility.cut_texts(page) + accessibility.overflows(page)
+        page.close()
+    running.mirror.close()
+    assert [re.sub(r"[\d.]+ s", "N s", tile) for tile in tiles] == [
+        "state.modeMODE_AUTOset N s ago by basestation",
+        "state.selected0never set",
+    ]
+    assert found == []
 
 
 @pytest.mark.parametrize("theme", THEMES)

@@ -6,9 +6,11 @@ import json
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 from router.observe.problems import Problem
+from router.observe.states import StateReading
 
 COLLECTED_AT = 1_500_000_000.25
 """The time at which the metrics were collected, in s."""
@@ -20,6 +22,7 @@ def answering(
     address: tuple[str, int] = ("127.0.0.1", 0),
     status: int = 200,
     problems: Sequence[Problem] = (),
+    states: Sequence[StateReading] = (),
     table: str = "",
     health: str | None = None,
 ) -> Iterator[str]:
@@ -29,7 +32,8 @@ def answering(
     """
     if health is None:
         listed = [problem.json() for problem in problems]
-        health = json.dumps({"name": "rover.yaml", "table": table, "received": 7, "problems": listed})
+        shown = [asdict(state) for state in states]
+        health = json.dumps({"name": "rover.yaml", "table": table, "received": 7, "states": shown, "problems": listed})
     answers = {"/metrics": text, "/health.json": health}
 
     class Handler(BaseHTTPRequestHandler):

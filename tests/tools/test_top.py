@@ -15,6 +15,7 @@ from rich.console import Console
 from router.compiler.metrics import LATENCY_BOUNDS_NS
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
+from router.observe.states import StateReading
 from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
 from router.tools.top_view import Page, Screen, keys, latency_text, reasons_text, targets_text
 from router.values.printing import age_text
@@ -169,6 +170,22 @@ def test_nothing_is_wrapped_and_every_route_shows_its_destinations(width: int, h
 def test_when_endpoints_were_last_heard_is_never_cut(width: int) -> None:
     shown = " ".join(printed(Screen(FULL, "title", Order.TABLE, 24), width))
     assert all(f"board_number_{index} {age_text(age)}" in shown for index, age in enumerate(FULL.silence.values()))
+
+
+def test_each_state_has_its_value_and_what_set_it() -> None:
+    states = (
+        StateReading("mode", "MODE_AUTO", "basestation", 0.4, is_valid=True),
+        StateReading("tool", "0", "ann", 70.0, is_valid=False),
+        StateReading("is_armed", "false", None, None, is_valid=False),
+    )
+    lines = printed(Screen(replace(FULL, states=states), "title", Order.TABLE, 24), 60)
+    first = next(index for index, line in enumerate(lines) if line.startswith("state "))
+    assert lines[first : first + 3] == [
+        "state mode MODE_AUTO, set 0.4 s ago by basestation",
+        "tool 0, last set 70 s ago by ann",
+        "is_armed false, never set",
+    ]
+    assert "and 2 more" in printed(Screen(replace(FULL, states=states), "title", Order.TABLE, 12), 60)[first + 1]
 
 
 def test_endpoints_without_room_are_counted() -> None:
