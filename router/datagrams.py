@@ -58,13 +58,7 @@ class Wire:
         if not payload.IsInitialized():
             fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
             raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
-        outer = self.envelope.message_class()
-        if beside is not None:
-            outer.CopyFrom(beside)
-        inner = getattr(outer, case.name)
-        inner.SetInParent()
-        inner.CopyFrom(payload)
-        return outer.SerializePartialToString()
+        return self.envelope.around(case, payload, beside).SerializePartialToString()
 
     def decode(self, datagram: bytes) -> Decoded:
         """Parse a datagram as a listener with `framing: zero_trimmed` does.
@@ -80,14 +74,14 @@ class Wire:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
-        name = outer.WhichOneof(self.envelope.oneof) if self.envelope.cases or self.envelope.unroutable else None
+        name = self.envelope.member_of(outer)
         if (other := self.envelope.unroutable.get(name or "")) is not None:
             raise DecodeError(f"unhandled: {name} is {other.type}, not a message")
-        if name is None:
+        if (found := self.envelope.payload_of(outer)) is None:
             reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
         *superseded, _ = payloads(self.envelope, whole, repairs=False)
-        return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram), superseded)
+        return Decoded(*found, len(whole) - len(datagram), superseded)
 
 
 def wire_of_table(table: RouteTable) -> Wire:
@@ -132,10 +126,7 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
         outer = envelope.message_class.FromString(restored(data) if repairs else data)
     except ProtobufError:
         return _why_malformed(envelope, whole)
-    name = outer.WhichOneof(envelope.oneof)
-    if name is not None:
-        return str(name)
-    return _why_no_payload(envelope, outer, whole)[1]
+    return envelope.member_of(outer) or _why_no_payload(envelope, outer, whole)[1]
 
 
 def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
@@ -198,7 +189,7 @@ def _lengths(datagram: bytes) -> Iterator[tuple[int, int]]:
 
 def _has_payload(envelope: Envelope, data: bytes) -> bool:
     outer = _parsed(envelope.message_class, data)
-    return outer is not None and outer.WhichOneof(envelope.oneof) is not None
+    return outer is not None and envelope.member_of(outer) is not None
 
 
 def _bare_payload(envelope: Envelope, datagram: bytes) -> str:

@@ -283,8 +283,7 @@ class Classifier:
             envelope = self.envelope.message_class.FromString(data)
         except ProtobufError:
             return None
-        case = self.envelope.case_of(envelope)
-        return (case, getattr(envelope, case.name)) if case else None
+        return self.envelope.payload_of(envelope)
 
     def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
@@ -303,8 +302,10 @@ class Classifier:
             envelope = self.envelope.message_class.FromString(restored(data))
         except ProtobufError:
             return None
-        case = self.envelope.case_of(envelope)
-        return (case, getattr(envelope, case.name).SerializePartialToString()) if case else None
+        if (found := self.envelope.payload_of(envelope)) is None:
+            return None
+        case, payload = found
+        return case, payload.SerializePartialToString()
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two

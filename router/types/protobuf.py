@@ -171,9 +171,23 @@ class Envelope:
         numbers = {name: case.number for name, case in self.cases.items()}
         return numbers | {name: member.number for name, member in self.unroutable.items()}
 
-    def case_of(self, message: Message) -> PayloadCase | None:
-        """Return the payload case of an envelope, None if it has none."""
-        return self.cases.get(message.WhichOneof(self.oneof) or "") if self.cases else None
+    def member_of(self, envelope: Message) -> str | None:
+        """Return the name of the case that a parsed envelope has, even of one that no route can take; None if none."""
+        name = envelope.WhichOneof(self.oneof) if self.cases or self.unroutable else None
+        return str(name) if name is not None else None
+
+    def payload_of(self, envelope: Message) -> tuple[PayloadCase, Message] | None:
+        """Return the payload of a parsed envelope and its case, None if it has none that a route can take."""
+        case = self.cases.get(self.member_of(envelope) or "")
+        return (case, getattr(envelope, case.name)) if case is not None else None
+
+    def around(self, case: PayloadCase, payload: Message) -> Message:
+        """Return an envelope with this payload, even an empty one. All other fields are empty."""
+        envelope = self.message_class()
+        inner = getattr(envelope, case.name)
+        inner.SetInParent()
+        inner.CopyFrom(payload)
+        return envelope
 
 
 def load_protos(
