@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 
-from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
@@ -17,8 +15,8 @@ from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_
 from router.table.model import RouteTable
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
-from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
-from router.types.wire import LEN, read_varint
+from router.types.protobuf import Envelope, MessageClass, PayloadCase, chosen_envelope, find_envelope, load_protos
+from router.types.wire import read_varint
 
 Peer = tuple[str, int]
 """The IP address and port of a sender."""
@@ -65,8 +63,6 @@ class Wire:
 
         Raises DecodeError, which begins with the reason under which the router counts such a datagram.
         """
-        if not datagram:
-            raise DecodeError("empty")
         if len(datagram) > MAX_DATAGRAM:
             raise DecodeError(f"truncated: {len(datagram)} bytes; the limit is {MAX_DATAGRAM}")
         whole = restored(datagram)
@@ -74,14 +70,14 @@ class Wire:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
-        name = self.envelope.member_of(outer)
-        if (other := self.envelope.unroutable.get(name or "")) is not None:
-            raise DecodeError(f"unhandled: {name} is {other.type}, not a message")
-        if (found := self.envelope.payload_of(outer)) is None:
+        if not (members := self.envelope.members_of(outer)):
             reason, detail = _why_no_payload(self.envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
+        if (other := self.envelope.unroutable.get(members[0])) is not None:
+            raise DecodeError(f"unhandled: {members[0]} is {other.type}, not a message")
+        ((case, message),) = self.envelope.payloads_of(outer)
         *superseded, _ = payloads(self.envelope, whole, repairs=False)
-        return Decoded(*found, len(whole) - len(datagram), superseded)
+        return Decoded(case, message, len(whole) - len(datagram), superseded)
 
 
 def wire_of_table(table: RouteTable) -> Wire:
@@ -89,9 +85,8 @@ def wire_of_table(table: RouteTable) -> Wire:
     if table.envelope is None:
         raise UsageError(f"{shown_path(table.path)} has no 'envelope', so there are no datagrams to build or parse")
     settings = table.envelope
-    return Wire(
-        find_envelope(load_protos(settings.protos, settings.message, settings.lock, settings.exclude), settings.oneof)
-    )
+    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
+    return Wire(chosen_envelope(schema, settings.choice))
 
 
 def wire_of_protos(root: Path) -> Wire:
@@ -119,26 +114,20 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
     """
     if length > MAX_DATAGRAM:
         return f"{length} bytes"
-    if not data:
-        return ""
     whole = data if len(data) == length else b""
     try:
         outer = envelope.message_class.FromString(restored(data) if repairs else data)
     except ProtobufError:
         return _why_malformed(envelope, whole)
-    return envelope.member_of(outer) or _why_no_payload(envelope, outer, whole)[1]
+    return ", ".join(envelope.members_of(outer)) or _why_no_payload(envelope, outer, whole)[1]
 
 
 def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
-    """Return the members of the oneof in a datagram in order. The last one counts; consecutive pieces are one.
+    """Return the payload cases in a datagram in order, also superseded ones; consecutive pieces are one.
 
     Raises protobuf's DecodeError.
     """
-    names = {(case.number, LEN): case.name for case in envelope.cases.values()}
-    names |= {(member.number, member.wire_type): name for name, member in envelope.unroutable.items()}
-    fields = UnknownFieldSet(Empty.FromString(restored(data) if repairs else data))
-    members = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
-    return [name for name, _ in groupby(names[member] for member in members if member in names)]
+    return [*envelope.choice.all_members(envelope, restored(data) if repairs else data)]
 
 
 def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tuple[str, str]:
@@ -147,7 +136,7 @@ def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tupl
     fields = UnknownFieldSet(outer)
     numbers = [fields[index].field_number for index in range(len(fields))]
     if not numbers:
-        return "no_payload", ""
+        return "no_payload" if datagram else "empty", ""
     # A payload case among the unknown fields has the wrong wire type.
     if known := [number for number in numbers if number in cases]:
         return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is not a message")
@@ -189,7 +178,7 @@ def _lengths(datagram: bytes) -> Iterator[tuple[int, int]]:
 
 def _has_payload(envelope: Envelope, data: bytes) -> bool:
     outer = _parsed(envelope.message_class, data)
-    return outer is not None and envelope.member_of(outer) is not None
+    return outer is not None and bool(envelope.members_of(outer))
 
 
 def _bare_payload(envelope: Envelope, datagram: bytes) -> str:

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the lock file. Raises TableError for broken `.proto` files or a broken lock file."""
     from router.types.lock import LockComparison
     from router.types.lock_file import read_lock, write_lock
-    from router.types.protobuf import find_envelope, load_protos, lock_path
+    from router.types.protobuf import chosen_envelope, load_protos, lock_path
 
     settings = _settings(args)
     path = lock_path(settings.protos, settings.lock)
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(what, "copy the protos with `router init --rover DIR`, and name the copy: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
-    envelope = find_envelope(schema, settings.oneof)
-    lock = LockComparison(schema, envelope)
+    envelope = chosen_envelope(schema, settings.choice)
+    lock = LockComparison(schema, envelope, None if args.protos else table_path(args))
     conflicts = lock.conflicts
     accepted = _accepted(args.accept, conflicts)
     if refused := [conflict for conflict in conflicts if conflict not in accepted]:
@@ -94,7 +94,7 @@ def _of_folder(root: Path) -> EnvelopeSettings:
     from router.table.model.settings import EnvelopeSettings
 
     span = SourceSpan(shown_path(root))
-    return EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+    return EnvelopeSettings(Located(root.absolute(), span), Located("", span))
 
 
 def _of_table(path: Path) -> EnvelopeSettings:
@@ -111,10 +111,14 @@ def _of_table(path: Path) -> EnvelopeSettings:
 def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock | None) -> EnvelopeSettings:
     """Set the names of envelope and oneof: as typed, else as in the table, else as in the lock, without package."""
     locked = (short_name(lock.message), lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
-    message = args.message or settings.message.value or locked[0]
-    oneof = args.oneof or settings.oneof.value or locked[1]
     span = settings.protos.span
-    return replace(settings, message=Located(message, span), oneof=Located(oneof, span))
+    settings = replace(settings, message=Located(args.message or settings.message.value or locked[0], span))
+    if args.oneof is None and settings.choice:
+        return settings
+    if args.oneof is None and not locked[1]:
+        what = "the lock file is of an envelope without a oneof"
+        raise UsageError(what, "give its table: --table FILE, not --protos")
+    return replace(settings, oneof=Located(args.oneof or locked[1], span), case=None)
 
 
 def _accepted(names: Sequence[str], conflicts: Sequence[Conflict]) -> list[Conflict]:

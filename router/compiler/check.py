@@ -32,7 +32,7 @@ from router.table.model.targets import Topic
 from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, places
 from router.types.lock import LockComparison
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
+from router.types.protobuf import Envelope, ProtoSchema, chosen_envelope, without_protos
 
 
 @contextmanager
@@ -101,7 +101,7 @@ def check_table(
     except TableError as error:
         return Checked(path, in_order([*findings, *error.diagnostics, *network_findings(table)]), table)
     table = with_types(table, envelope.cases, findings)
-    lock = LockComparison(schema, envelope) if table.envelope else None
+    lock = LockComparison(schema, envelope, path) if table.envelope else None
     board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
     boards = _boards(table, schema, envelope, board_limit)
     lookup = Lookup(table, schema, envelope, definitions, board_limit, boards)
@@ -143,7 +143,9 @@ def _has_errors(findings: Iterable[Diagnostic]) -> bool:
 def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: int) -> Mapping[str, BoardLimits]:
     """Return the limits of each board by name; `limit` is the largest envelope in bytes."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
-    fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
+    if not boards:
+        return {}
+    fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
     return {board.name: BoardLimits(fields, limit, board.allow_non_finite) for board in boards}
 
 
@@ -193,4 +195,4 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
     if table.envelope is None:
         return without_protos()
     schema = definitions.protos(table.envelope)
-    return schema, find_envelope(schema, table.envelope.oneof)
+    return schema, chosen_envelope(schema, table.envelope.choice)

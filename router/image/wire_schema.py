@@ -1,4 +1,4 @@
-"""The message types of an envelope, as arrays for `envelope_read`."""
+"""The message types of an envelope, and how it says which message it holds, as arrays for `envelope_read`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router import declared as c
 from router.compiler.lowering.arrays import Arrays
-from router.declared import WireFlag, WireKind
+from router.declared import CaseBy, WireFlag, WireKind
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope
 from router.types.undecidable import all_fields, all_types
@@ -32,14 +32,16 @@ _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.
 def write_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
     """Write the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
     descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
-    flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
+    held = {} if envelope.choice.root else envelope.numbers
+    flags = {number: _case_flags(number, routed) for number in held.values()}
     indexes = all_types(descriptor)
     types = []
     for each, index in indexes.items():
         fields = _lowered(each, indexes, {} if index else flags)
         accepts_zero = parses(each, delimited(0, b""))
         types.append(c.WireType(fields=arrays.array(c.WireField, fields), count=len(fields), accepts_zero=accepts_zero))
-    return arrays.add(c.WireSchema(types=arrays.array(c.WireType, types), count=len(types)))
+    by = CaseBy[envelope.choice.by.upper()]
+    return c.WireSchema(types=arrays.array(c.WireType, types), count=len(types), case_by=by)
 
 
 def _case_flags(number: int, routed: Container[int]) -> int:

@@ -111,17 +111,24 @@ class _Writer:
         return self.targets.arrays
 
     def program_of(self, plans: list[RoutePlan]) -> c.Program:
-        program = self.program
+        protocol = ctypes.pointer(self._protocol())
         return c.Program(
-            listener_count=len(program.listeners),
-            case_count=len(program.envelope.numbers),
-            unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
-            state_count=len(program.states),
+            listener_count=len(self.program.listeners),
+            state_count=len(self.program.states),
             states=self.targets.states,
-            schema=ctypes.pointer(write_schema(program.envelope, program.inbound.keys(), self.arrays)),
-            listeners=self.arrays.array(c.Listener, [self._listener(*each) for each in self._framings()]),
-            cases=self.arrays.array(c.PayloadCase, self._cases()),
+            listeners=self.arrays.array(c.Listener, [self._listener(*each, protocol) for each in self._framings()]),
             routes=self.arrays.array(c.Route, [self._route(plan) for plan in plans]),
+        )
+
+    def _protocol(self) -> c.Protocol:
+        program = self.program
+        return self.arrays.add(
+            c.Protocol(
+                schema=write_schema(program.envelope, program.inbound.keys(), self.arrays),
+                cases=self.arrays.array(c.PayloadCase, self._cases()),
+                case_count=len(program.envelope.numbers),
+                unknown_case=self.counters.index("unhandled", UNKNOWN_CASE),
+            )
         )
 
     # senders and payload cases
@@ -142,13 +149,14 @@ class _Writer:
     def _framings(self) -> Iterator[tuple[str, Framing]]:
         yield from ((plan.name, plan.framing) for plan in self.program.listeners)
 
-    def _listener(self, name: str, framing: Framing) -> c.Listener:
+    def _listener(self, name: str, framing: Framing, protocol: ctypes._Pointer[c.Protocol]) -> c.Listener:
         """Write a listener, without its socket."""
         counters, peers = self.counters, list(self._peers(name))
         return c.Listener(
             fd=-1,
             id=self.targets.openings.names.number(name),
             repairs=framing is Framing.ZERO_TRIMMED,
+            protocol=protocol,
             peers=self.arrays.array(c.Peer, peers),
             choices=self.arrays.array(c.Choice, list(self._choices())),
             peer_count=len(peers),

@@ -32,7 +32,7 @@ from router.log import FloodLog, fault, logger_of_library
 from router.net.doors import Door, is_foreign, listen
 from router.observe.running import Running
 from router.recording.channels import descriptor_set
-from router.recording.mirror import Classifier, Mirrored, payload_number
+from router.recording.mirror import Classifier, Mirrored
 from router.table.addresses import Address
 from router.table.model.settings import ServerSettings
 from router.threads import ACCEPTED_AFTER_CLOSING, Thread, background_threads, join_or_abandon
@@ -312,10 +312,11 @@ class FoxgloveServer:
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
         """Send the accepted payloads of subscribed channels. Called by the mirror."""
-        _, classifier, channels = self._view
+        program, classifier, channels = self._view
+        number_of = program.envelope.choice.first_number
         messages = []
         for at, listener, _, _, reason, data in batch:
-            if reason or channels.get(payload_number(data, channels)) not in self._wanted:
+            if reason or channels.get(number_of(data, channels)) not in self._wanted:
                 continue
             if (found := classifier.encoded_payload(listener, data)) is not None:
                 case, payload = found

@@ -13,7 +13,7 @@ from typing import Any
 from router.clock import boottime_ns
 from router.compiler.compiled_table import CompiledTable
 from router.observe.running import Running
-from router.recording.mirror import Classifier, Mirrored, payload_number
+from router.recording.mirror import Classifier, Mirrored
 from router.threads import Thread
 from router.values.printing import protobuf_json
 
@@ -66,12 +66,13 @@ class LastValues:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Remember the newest datagrams. Called by the mirror."""
-        now, numbers = boottime_ns(), frozenset(self._running.program.envelope.numbers.values())
+        now, envelope = boottime_ns(), self._running.program.envelope
+        numbers = frozenset(envelope.numbers.values())
         with self._newest_lock:
             for datagram in batch:
                 *_, reason, data = datagram
                 if not reason:
-                    self._newest[payload_number(data, numbers)] = now, datagram
+                    self._newest[envelope.choice.first_number(data, numbers)] = now, datagram
 
     def _decode(self, at: int, datagram: Mirrored, classifier: Classifier) -> None:
         _, listener, peer, endpoint, _, data = datagram

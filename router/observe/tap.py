@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from router.compiler.compiled_table import CompiledTable
 from router.errors import RouterError, TransportError, did_you_mean
-from router.recording.mirror import Acted, Action, Mirror, Mirrored, MirroredDatagram, payload_number
+from router.recording.mirror import Acted, Action, Mirror, Mirrored, MirroredDatagram
 
 MAGIC = b"router tap 2\n"
 CONTENT_TYPE = "application/x-router-tap"
@@ -86,12 +86,12 @@ def _of_case(program: CompiledTable, cases: Sequence[str]) -> Wanted:
     known = program.envelope.cases
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
-    numbers = frozenset(program.envelope.numbers.values())
+    number_of, numbers = program.envelope.choice.first_number, frozenset(program.envelope.numbers.values())
     unwanted = numbers - {known[name].number for name in cases}
 
     def is_wanted(datagram: Mirrored) -> bool:
         *_, data = datagram
-        return payload_number(data, numbers) not in unwanted
+        return number_of(data, numbers) not in unwanted
 
     return is_wanted
 

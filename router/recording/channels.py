@@ -40,7 +40,7 @@ class Holds(enum.Enum):
 
     PAYLOAD = "payload"
     """Payloads of datagrams with one field, encoded as protobuf encodes it: tag and length follow from number and
-    payload."""
+    payload. With number 0 the datagram is the payload."""
     DATAGRAM = "datagram"
     """All other datagrams, byte for byte."""
     VIEW = "view"
@@ -105,7 +105,7 @@ class Channels:
 
 
 def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
-    return {"holds": holds.value, "number": str(case.number)}
+    return {"holds": holds.value, "number": str(case.wrapping.tag >> 3)}
 
 
 def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:

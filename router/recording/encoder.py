@@ -13,6 +13,7 @@ from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.recording.channels import Channels, Datagram, Event
 from router.recording.mirror import Acted, Action, Classifier, Mirrored, Taken
+from router.types.protobuf import PayloadCase
 from router.types.wire import varint
 
 T = TypeVar("T")
@@ -163,10 +164,9 @@ class Encoder:
         if len(self._shapes) >= _MOST_SHAPES:
             self._shapes.clear()
         listener, peer, endpoint, reason, length, _ = key
-        tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
-        case = classifier.cases_by_tag.get(tag)
         shape = _Shape(None, b"", bytes)
-        if case is not None and length <= MAX_DATAGRAM and (header := _header(tag, length)) is not None:
+        if length <= MAX_DATAGRAM and (found := _only_payload(classifier, data, length)) is not None:
+            case, header = found
             channel = self._channels.payload(case, listener, peer, endpoint, reason)
             shape = _Shape(channel, header, case.message_class.FromString)
         self._shapes[key] = shape
@@ -190,6 +190,15 @@ class Encoder:
             return self._channels.sent(case, what, route, target, topic), payload
         event = Event(what=what, route=route, endpoint=target, ros=topic, reason=reason, detail=detail, data=data)
         return self._channels.events(), event.SerializeToString()
+
+
+def _only_payload(classifier: Classifier, data: bytes, length: int) -> tuple[PayloadCase, bytes] | None:
+    """Return the payload case of a datagram that has only a payload, and what precedes it; else None."""
+    if classifier.frame_case is not None:
+        return classifier.frame_case, b""
+    tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
+    case, header = classifier.cases_by_tag.get(tag), _header(tag, length)
+    return (case, header) if case is not None and header is not None else None
 
 
 def _header(tag: bytes, length: int) -> bytes | None:

@@ -6,7 +6,7 @@ While no consumer is attached, the native threads do nothing for it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
@@ -22,7 +22,7 @@ from router.table.model.endpoints import Framing
 from router.threads import Thread, WakeEvent, join_or_abandon
 from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase
-from router.types.wire import I32, I32_SIZE, I64, I64_SIZE, LEN, VARINT, read_varint, varint
+from router.types.wire import varint
 
 PERIOD = 50_000_000
 """ns between two batches: waking consumers for each datagram would cost more than routing it."""
@@ -270,7 +270,9 @@ class Classifier:
         self._trimming = frozenset(
             listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
         )
-        self.cases_by_tag = {varint(case.number << 3 | LEN): case for case in envelope.cases.values()}
+        self.cases_by_tag = {varint(case.wrapping.tag): case for case in envelope.cases.values() if case.wrapping.tag}
+        self.frame_case = next((case for case in envelope.cases.values() if not case.wrapping.tag), None)
+        """The case of an envelope that is itself the payload."""
         self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
 
     def payload(self, listener: str, data: bytes) -> tuple[PayloadCase, Message] | None:
@@ -283,7 +285,7 @@ class Classifier:
             envelope = self.envelope.message_class.FromString(data)
         except ProtobufError:
             return None
-        return self.envelope.payload_of(envelope)
+        return next(iter(self.envelope.payloads_of(envelope)), None)
 
     def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
@@ -302,10 +304,9 @@ class Classifier:
             envelope = self.envelope.message_class.FromString(restored(data))
         except ProtobufError:
             return None
-        if (found := self.envelope.payload_of(envelope)) is None:
-            return None
-        case, payload = found
-        return case, payload.SerializePartialToString()
+        for case, payload in self.envelope.payloads_of(envelope):
+            return case, payload.SerializePartialToString()
+        return None
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two
@@ -338,31 +339,3 @@ class Classifier:
 
 
 _NOBODY: tuple[dict[str, str], dict[Peer, str]] = {}, {}
-
-
-def payload_number(data: bytes, numbers: Container[int]) -> int:
-    """Return the first field of an envelope that has one of these `numbers`, 0 if none is found.
-
-    With the numbers of the payload cases it is the case's, at a fraction of the cost of `Classifier.payload`; but of a
-    datagram with several payloads, the first one's.
-    """
-    position = 0
-    try:
-        while position < len(data):
-            tag, position = read_varint(data, position)
-            if tag >> 3 in numbers:
-                return tag >> 3
-            position = _after(data, position, tag & 7)
-    except IndexError:
-        pass  # it ends early: zeros were trimmed, or it is malformed
-    return 0
-
-
-def _after(data: bytes, position: int, wire_type: int) -> int:
-    """Return the position after a value; for a group, the end. Raises IndexError."""
-    if wire_type == VARINT:
-        return read_varint(data, position)[1]
-    if wire_type == LEN:
-        size, position = read_varint(data, position)
-        return position + size
-    return position + {I64: I64_SIZE, I32: I32_SIZE}.get(wire_type, len(data))

@@ -191,7 +191,9 @@ def _decoder(metadata: dict[str, str]) -> _Decoder:
 
 
 def _rebuild(number: str) -> Callable[[bytes], bytes]:
-    """Return a function that puts a payload with this field number into an envelope."""
+    """Return a function that puts a payload into an envelope, as the field with this number; 0 if it has none."""
+    if not int(number):
+        return lambda payload: payload
     tag = varint(int(number) << 3 | LEN)
     return lambda payload: b"".join((tag, varint(len(payload)), payload))
 

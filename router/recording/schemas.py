@@ -9,6 +9,8 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
+from router.declared import ONLY_CASE
+from router.types.case_by import ByFrame, ByOneof, Wrapping
 from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types
 
@@ -16,7 +18,10 @@ _FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "
 
 
 class RecordedCase(NamedTuple):
-    """A payload case. `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares."""
+    """A payload case. `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares.
+
+    `number` is that of the field that holds it; 0 for the only case of an envelope that is itself the payload.
+    """
 
     name: str
     number: int
@@ -34,6 +39,7 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
                 pool.AddSerializedFile(file.SerializeToString())
     own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
     message = own.message_type.add(name="Recorded")
+    frame = named.pop(0, None)
     if named:  # protobuf refuses an empty oneof
         message.oneof_decl.add(name=_ONEOF)
     for number, case in named.items():
@@ -43,14 +49,13 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
         )
     pool.AddSerializedFile(own.SerializeToString())
     types, _ = build_types(pool, [*files], {}, lambda _: NO_OPTIONS)
-    payload_cases = {
-        case.name: PayloadCase(
-            case.name,
-            number,
-            types[case.message],
-            GetMessageClass(pool.FindMessageTypeByName(case.message)),
-            None,
-        )
-        for number, case in sorted(named.items())
-    }
-    return Envelope(_NAME, _ONEOF, GetMessageClass(pool.FindMessageTypeByName(_NAME)), payload_cases, 0)
+
+    def made(case: RecordedCase, number: int, wrapped: Wrapping | None = None) -> PayloadCase:
+        message_class = GetMessageClass(pool.FindMessageTypeByName(case.message))
+        return PayloadCase(case.name, number, types[case.message], message_class, None, wrapped)
+
+    if frame is not None:
+        only = made(frame, ONLY_CASE, Wrapping(0))
+        return Envelope(frame.message, ByFrame(frame.name), only.message_class, {only.name: only}, 0)
+    payload_cases = {case.name: made(case, number) for number, case in sorted(named.items())}
+    return Envelope(_NAME, ByOneof(_ONEOF), GetMessageClass(pool.FindMessageTypeByName(_NAME)), payload_cases, 0)

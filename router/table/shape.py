@@ -41,7 +41,8 @@ _HINTS_FOR_MISSING = {
     "transport": "add it, or write 'ignore: why'",
     "version": "start with 'version: 1'",
     "message": "name the protobuf message of each datagram, as in `message: PBEnvelope`",
-    "oneof": "name the oneof whose members are the payload cases, as in `oneof: payload`",
+    "oneof": "name the oneof whose members are the payload cases, as in `oneof: payload`; "
+    "or, if a datagram is itself the message, write `case: NAME` instead",
     "fields": "add the fields of one message, as in `fields: {x: x / 1000}` or `fields: auto`",
     "receive": "add the local address that receives what its client publishes: `receive: IP:PORT`",
     "directory": "add the folder for recordings, as in `directory: ../recordings`",
@@ -298,7 +299,8 @@ def _bad_name(error: SchemaError, span: SourceSpan) -> Diagnostic:
 
 def _is_chosen(path: Path) -> bool:
     """Return whether the key at the path is a name chosen by the table, not a key that its siblings exclude."""
-    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in key_hints.NAME_FIELDS)
+    is_part = len(path) <= _NAME_DEPTH and path[:1] != ("envelope",)
+    return is_part or any(key in path[_NAME_DEPTH:-1] for key in key_hints.NAME_FIELDS)
 
 
 def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:

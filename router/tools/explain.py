@@ -45,7 +45,6 @@ from router.table.model.targets import OnLimit, Topic
 from router.table.units import duration
 from router.tools.udp import LOOPBACK, origin
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
-from router.types.boards import framed_size
 from router.types.protobuf import PayloadCase
 from router.values.reading import payload
 
@@ -61,10 +60,10 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
     route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
     assert table is not None  # noqa: S101 - a table without errors is one
     assert envelope is not None  # noqa: S101 - and has one
-    yield f"{route.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.span})"
+    yield f"{route.name}: {case.type.name}, {envelope.choice.place(envelope.name, case)}  ({route.span})"
     if case.max_size is not None:
-        datagram = framed_size(case.number, case.max_size)
-        yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
+        inside = f", {case.max_frame} in its envelope" if case.wrapping.tag else ""
+        yield f"  largest encoding: {case.max_size} bytes{inside}"
     elif everything.program is not None:
         yield f"  largest encoding: none, because {everything.program.protos.unbounded(case.type.name)}"
     if route.ignore is not None:
@@ -217,11 +216,12 @@ def _waiting(served: Target) -> Iterator[str]:
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
     """Yield the limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
-    payload, prefix = board.fields.get(case.number), f"{case.name}."
-    fields = list(_bounded(payload.message)) if payload is not None and payload.message is not None else []
+    payload, prefix = board.payload(case.wrapping), f"{case.name}."
+    fields = list(_bounded(payload))
     if any(field.is_float for field in fields):
         yield "NaN and infinity allowed" if board.allows_non_finite else "no NaN or infinity"
-    beside = [field for field in board.fields.values() if field is not payload]
+    held = case.wrapping.tag >> 3
+    beside = [field for number, field in board.fields.items() if number != held] if held else []
     if required := [field.path.removeprefix(prefix) for field in (*fields, *beside) if field.is_required]:
         yield f"with {', '.join(required)}"
     for field in fields:

@@ -91,6 +91,9 @@ def site_of(checked: Checked, messages: Path) -> Site:
     settings = checked.table.envelope
     if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
+    if settings.oneof is None:
+        hint = "write the message, and its route, by hand"
+        raise UsageError(f"{checked.path} has an envelope without a oneof: 'router new' adds members of a oneof", hint)
     # A field's type may be in a file of its own.
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude, with_others=True)
     return Site(checked.table, settings, schema, checked.envelope, messages)

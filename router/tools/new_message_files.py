@@ -19,7 +19,7 @@ from router.tools.new_message import SCALARS, NewField, NewMessage, Site
 from router.types.lock import LockComparison
 from router.types.lock_file import lock_text
 from router.types.model import Bool, Enum, Float, MessageType, Type
-from router.types.protobuf import find_envelope, load_protos
+from router.types.protobuf import chosen_envelope, load_protos
 
 _WIDEST = 120
 _LONGEST_FIELD = 60
@@ -110,7 +110,7 @@ class Written:
 def locked(site: Site) -> str:
     """Return the lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
     schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
-    lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
+    lock = LockComparison(schema, chosen_envelope(schema, site.settings.choice))
     errors = [finding for finding in lock.findings() if finding.severity is Severity.ERROR]
     if errors:
         raise UsageError("; ".join(finding.message for finding in errors))
@@ -148,7 +148,7 @@ def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
     places = {
         field: site.schema.span(site.envelope.name, field.name).line
         for field in site.schema.messages[site.envelope.name].fields
-        if field.oneof == site.envelope.oneof
+        if field.oneof == site.envelope.choice.oneof
     }
     last = max(places, key=lambda field: places[field])
     end = next(index for index in range(places[last] - 1, len(lines)) if ";" in lines[index])

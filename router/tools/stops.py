@@ -12,7 +12,7 @@ from router.errors import plural
 from router.observe.health import REMEDIES
 from router.observe.problems import Kind
 from router.recording.about import RecordedRoute
-from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, payload_number
+from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model.routes import ANY
 from router.tools.tap import local_time, utc_text
@@ -266,7 +266,7 @@ class Stops:
                 last[route].obeyed.append(text)
 
     def _received(self, it: Recorded) -> None:
-        sender, case = it.endpoint or it.peer[0], self._names.get(payload_number(it.data, self._names), "")
+        sender, case = it.endpoint or it.peer[0], self._case_of(it.data)
         self._heard[sender] = it.at, it.peer[0]
         for state in self._states.values():
             if (stop := state.stop) is not None and sender in (*stop.settings.sources, *stop.settings.brakes):
@@ -298,7 +298,7 @@ class Stops:
         elif it.what == RELEASED and state.stop is not None:
             state.stop.released, state.stop = it.at, None
         elif it.what == BRAKED and state.stop is not None:
-            case = self._names.get(payload_number(it.data, self._names), "")
+            case = self._case_of(it.data)
             state.stop.brakes[case, it.target, ": ".join(filter(None, (it.reason, it.detail)))] += 1
 
     def _tripped(self, it: Action, state: _State) -> None:
@@ -311,6 +311,9 @@ class Stops:
         decoded = self._wire.decode(it.data)
         sender = f"topic {it.topic}" if it.topic else self._sender(it.route)
         return Fed(it.at, decoded.case.name, compact(decoded.message, decoded.case.type), sender)
+
+    def _case_of(self, data: bytes) -> str:
+        return self._names.get(self._wire.envelope.choice.first_number(data, self._names), "")
 
     def _sender(self, route: str) -> str:
         """Return who sent the last command that the route accepted; "" if that is not in the recording."""

@@ -15,6 +15,7 @@ from google.protobuf.message import Message
 
 from router.errors import plural
 from router.types.boards import OptionsOf, integers, is_list, is_required, longest, stored_type, why_unbounded
+from router.types.case_by import Wrapping
 from router.types.descriptors import message_of
 from router.types.model import Int
 
@@ -85,6 +86,13 @@ class BoardLimits:
     fields: BoardMessage
     longest: int
     allows_non_finite: bool
+
+    def payload(self, wrapping: Wrapping) -> BoardMessage:
+        """Return the fields of a payload that the envelope holds like this."""
+        if not wrapping.tag:
+            return self.fields
+        held = self.fields.get(wrapping.tag >> 3)
+        return held.message or {} if held is not None else {}
 
     def misfit(self, field: BoardField, value: object) -> str:
         """Return why a scalar of a payload does not fit its field; empty if it does."""

@@ -106,11 +106,6 @@ def member_size(field: FieldDescriptor, options_of: OptionsOf) -> int | None:
     return _field_size(field, options, options_of)
 
 
-def framed_size(number: int, payload: int) -> int:
-    """Return the size of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
-    return len(varint(number << 3)) + len(varint(payload)) + payload
-
-
 def unbounded_fields(
     message: Descriptor, options_of: OptionsOf, path: tuple[FieldDescriptor, ...] = ()
 ) -> Iterator[Unbounded]:
@@ -196,14 +191,14 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
     `limit` is the largest envelope in bytes that boards accept, `span` the place in the table that sends the case to a
     board.
     """
-    member = schema.descriptor(schema.envelope).fields_by_name[case.name]
-    if schema.board_options(member).is_ignored:
+    member = schema.descriptor(schema.envelope).fields_by_number.get(case.wrapping.tag >> 3)
+    if member is not None and schema.board_options(member).is_ignored:
         message = f"a board ignores {case.name}: nanopb's options leave it out of the firmware"
-        hint = f"see {schema.span(schema.envelope, case.name)}; remove `type:FT_IGNORE`"
+        hint = f"see {schema.span(schema.envelope, member.name)}; remove `type:FT_IGNORE`"
         return [Diagnostic(span, Code.BOARD_PAYLOAD, message, hint)]
     unbounded = unbounded_fields(schema.descriptor(case.type.name), schema.board_options)
     findings = [_unbounded_finding(case, field, schema, span) for field in unbounded]
-    if case.max_size is not None and (size := framed_size(case.number, case.max_size)) > limit:
+    if (size := case.max_frame) is not None and size > limit:
         message = f"an envelope with {case.name} takes up to {size} bytes; boards reject more than {limit}"
         hint = f"see {schema.span(case.type.name)}; make the message smaller, or flash the boards and lock the new size"
         findings.append(Diagnostic(span, Code.BOARD_PAYLOAD, message, hint))

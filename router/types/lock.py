@@ -22,6 +22,7 @@ from google.protobuf.descriptor_pb2 import DescriptorProto
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, shown_path
 from router.types.descriptors import declared_type
 from router.types.lock_file import (
+    BY_ONEOF,
     ENVELOPE,
     LOCK_NAME,
     ONEOF,
@@ -52,11 +53,12 @@ class Conflict:
 class LockComparison:
     """The differences between the `.proto` files and their lock file, which is read once.
 
+    `table` names the envelope; the command that records the protos needs it if they are not enough.
     `lock` is the content of the file, or None. `conflicts` are incompatible changes, `additions` are warnings about new
     declarations, `faults` are problems with the file itself.
     """
 
-    def __init__(self, schema: ProtoSchema, envelope: Envelope) -> None:
+    def __init__(self, schema: ProtoSchema, envelope: Envelope, table: Path | None = None) -> None:
         self._schema = schema
         self._envelope = envelope
         self._current = _current_lock(schema, envelope)
@@ -68,7 +70,7 @@ class LockComparison:
             self.lock = read_lock(schema.lock)
         except TableError as error:
             self.faults = error.diagnostics
-        self._command = _command(schema, envelope, self.lock)
+        self._command = _command(schema, envelope, self.lock, table)
         if self.lock is not None:
             self._compare_with(self.lock)
 
@@ -126,9 +128,12 @@ class LockComparison:
 
     def _compare_envelopes(self, envelope: Envelope, lock: Lock, locked: Lock, names: Mapping[str, str]) -> None:
         span = self._schema.span(envelope.name)
-        if (names.get(lock.message, lock.message), locked.oneof) != (envelope.name, envelope.oneof):
-            message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {envelope.name}.{envelope.oneof}"
-            self._refuse(envelope.name, envelope.oneof, span, message, "name the locked envelope in the table")
+        choice = envelope.choice
+        if (names.get(lock.message, lock.message), locked.by, locked.oneof) != (envelope.name, choice.by, choice.oneof):
+            was, now = _envelope_text(lock), _envelope_text(self._current)
+            message = f"the lock is for the envelope {was}, not {now}"
+            what = choice.oneof or choice.by
+            self._refuse(envelope.name, what, span, message, "name the locked envelope in the table")
         if names:
             old = min(names)
             more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
@@ -236,16 +241,22 @@ def _shown(entry: Entry) -> str:
     return f"`{entry.type} {entry.name} = {entry.number}`".replace("` ", "`")
 
 
-def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
+def _envelope_text(lock: Lock) -> str:
+    return f"{lock.message}.{lock.oneof}" if lock.by == BY_ONEOF else f"{lock.message} (by {lock.by})"
+
+
+def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None, table: Path | None) -> str:
     """Return the command that records these protos, to be run in the router's working directory."""
+    if envelope.choice.by != BY_ONEOF and table is not None:
+        return shlex.join(["router", "schema", "lock", "--table", shown_path(table)])
     message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
     words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]
     if schema.lock != schema.root / LOCK_NAME:
         words += ["--lock", shown_path(schema.lock)]
     if short_name(envelope.name) != short_name(message):
         words += ["--message", envelope.name]
-    if envelope.oneof != oneof:
-        words += ["--oneof", envelope.oneof]
+    if envelope.choice.oneof != oneof:
+        words += ["--oneof", envelope.choice.oneof]
     return shlex.join(words)
 
 
@@ -261,7 +272,8 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
         if (file := schema.sources.file(name)) in schema.files:
             entries = frozenset(Entry(number, value) for value, number in declared.values)
             enums[name] = Declaration(file, entries, _reserved(schema, name))
-    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
+    choice = envelope.choice
+    return Lock(envelope.name, choice.oneof, envelope.max_size, messages, enums, choice.by)
 
 
 def _entries(message: Descriptor) -> Iterator[Entry]:

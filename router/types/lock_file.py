@@ -17,6 +17,8 @@ LOCK_NAME = "envelope.lock.json"
 ENVELOPE, ONEOF = "PBEnvelope", "payload"
 """The envelope's names if neither a table nor a lock specifies them."""
 
+BY_ONEOF = "oneof"
+
 _FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
 
 
@@ -47,13 +49,17 @@ class Declaration:
 
 @dataclass(frozen=True, slots=True)
 class Lock:
-    """The content of a lock file. `max_size` is the envelope's largest encoding in bytes in the boards' firmware."""
+    """The content of a lock file. `max_size` is the envelope's largest encoding in bytes in the boards' firmware.
+
+    `by` says how the envelope holds payloads (`Choice.by`), with the name of its oneof if that is "oneof".
+    """
 
     message: str
     oneof: str
     max_size: int
     messages: Mapping[str, Declaration]
     enums: Mapping[str, Declaration]
+    by: str = BY_ONEOF
 
 
 def read_lock(path: Path) -> Lock | None:
@@ -80,8 +86,9 @@ def read_lock(path: Path) -> Lock | None:
 
 def lock_text(lock: Lock) -> str:
     """Return the text of the file: sorted, one line per number."""
+    by = {"oneof": lock.oneof} if lock.by == BY_ONEOF else {"by": lock.by}
     content = {
-        "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
+        "envelope": {"message": lock.message, **by, "max_size": lock.max_size},
         "messages": {
             name: _declaration(message, "fields", {str(entry.number): _field(entry) for entry in by_number(message)})
             for name, message in sorted(lock.messages.items())
@@ -149,12 +156,14 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _parsed(content: Any) -> Lock:
     """Parse the content. Raises ValueError, LookupError, TypeError or AttributeError if its structure differs."""
     envelope = content["envelope"]
+    by = str(envelope.get("by", BY_ONEOF))
     return Lock(
         message=str(envelope["message"]),
-        oneof=str(envelope["oneof"]),
+        oneof=str(envelope["oneof"]) if by == BY_ONEOF else "",
         max_size=int(envelope["max_size"]),
         messages={name: _declared(message, "fields", _field_entries) for name, message in content["messages"].items()},
         enums={name: _declared(enum, "values", _value_entries) for name, enum in content["enums"].items()},
+        by=by,
     )
 
 

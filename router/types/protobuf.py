@@ -23,15 +23,16 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
 from router import inputs
+from router.declared import ONLY_CASE
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, plural, shown_path
 from router.types.boards import (
-    framed_size,
     largest_beside,
     largest_encoding,
     longest,
     member_size,
     unbounded_fields,
 )
+from router.types.case_by import ByFrame, ByOneof, Choice, Wrapping
 from router.types.descriptors import declared_type, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
@@ -40,7 +41,7 @@ from router.types.proto_files import OPTIONS, Folder, envelope_file, proto_of, r
 from router.types.proto_source import Part, ProtoSources, field_comments, holders, inside
 from router.types.protoc import check_protos, compile_protos, findings_of, shipped
 from router.types.undecidable import undecidable
-from router.types.wire import encoding_of, validates_text
+from router.types.wire import LEN, encoding_of, validates_text
 
 MessageClass = type[Message]
 
@@ -128,9 +129,10 @@ class ProtoSchema:
 
 @dataclass(frozen=True, slots=True)
 class PayloadCase:
-    """One member of the envelope's oneof.
+    """One of the messages that an envelope can hold. `number` is unique among them: that of its field, if it has one.
 
-    `max_size` is the largest encoding of the payload in bytes as nanopb computes it, None when unbounded.
+    `max_size` is the largest encoding of the payload in bytes as nanopb computes it, None when unbounded. `wrapped`
+    says how the envelope holds it, None for a field with its number.
     """
 
     name: str
@@ -138,6 +140,16 @@ class PayloadCase:
     type: MessageType
     message_class: MessageClass
     max_size: int | None
+    wrapped: Wrapping | None = None
+
+    @property
+    def wrapping(self) -> Wrapping:
+        return self.wrapped if self.wrapped is not None else Wrapping(self.number << 3 | LEN)
+
+    @property
+    def max_frame(self) -> int | None:
+        """The largest encoding in bytes of an envelope with only this payload, None when unbounded."""
+        return self.wrapping.size(self.max_size) if self.max_size is not None else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +165,12 @@ class Unroutable:
 class Envelope:
     """The message around every payload, by full name. `beside` has only its fields beside the payload.
 
-    `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. The members
-    of its oneof are the `cases`, and those that no route can take.
+    `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. `choice` says
+    which of the `cases` a frame holds; `unroutable` are those that no route can take.
     """
 
     name: str
-    oneof: str
+    choice: Choice
     message_class: MessageClass
     cases: Mapping[str, PayloadCase]
     max_size: int
@@ -167,26 +179,25 @@ class Envelope:
 
     @property
     def numbers(self) -> Mapping[str, int]:
-        """The field numbers of all members of the oneof."""
+        """The numbers of all cases, also of those that no route can take."""
         numbers = {name: case.number for name, case in self.cases.items()}
         return numbers | {name: member.number for name, member in self.unroutable.items()}
 
-    def member_of(self, envelope: Message) -> str | None:
-        """Return the name of the case that a parsed envelope has, even of one that no route can take; None if none."""
-        name = envelope.WhichOneof(self.oneof) if self.cases or self.unroutable else None
-        return str(name) if name is not None else None
+    def members_of(self, frame: Message) -> Sequence[str]:
+        """Return the names of the cases that a parsed frame holds, even of those that no route can take."""
+        return self.choice.members_of(frame) if self.cases or self.unroutable else ()
 
-    def payload_of(self, envelope: Message) -> tuple[PayloadCase, Message] | None:
-        """Return the payload of a parsed envelope and its case, None if it has none that a route can take."""
-        case = self.cases.get(self.member_of(envelope) or "")
-        return (case, getattr(envelope, case.name)) if case is not None else None
+    def payloads_of(self, frame: Message) -> list[tuple[PayloadCase, Message]]:
+        """Return the payloads of a parsed frame that a route can take, with their cases."""
+        cases = (self.cases[name] for name in self.members_of(frame) if name in self.cases)
+        return [(case, self.choice.payload(frame, case.name)) for case in cases]
 
-    def around(self, case: PayloadCase, payload: Message) -> Message:
-        """Return an envelope with this payload, even an empty one. All other fields are empty."""
+    def around(self, case: PayloadCase, payload: Message, beside: Message | None = None) -> Message:
+        """Return an envelope with this payload, even an empty one, and with the other fields of `beside`."""
         envelope = self.message_class()
-        inner = getattr(envelope, case.name)
-        inner.SetInParent()
-        inner.CopyFrom(payload)
+        if beside is not None:
+            envelope.CopyFrom(beside)
+        self.choice.put(envelope, case.name, payload)
         return envelope
 
 
@@ -261,7 +272,7 @@ def _note_hidden(folder: Folder, compiled: Collection[str]) -> None:
 def without_protos() -> tuple[ProtoSchema, Envelope]:
     """Return empty declarations, and an envelope without payload cases, for a table without an envelope."""
     schema = ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
-    return schema, Envelope("", "", Empty, {}, 0)
+    return schema, Envelope("", ByOneof(""), Empty, {}, 0)
 
 
 def lock_path(protos: Located[Path], lock: Located[Path] | None) -> Path:
@@ -352,6 +363,27 @@ def _with_reserved_number(file: FileDescriptorProto) -> list[str]:
 _RESERVED_NUMBERS = range(FieldDescriptor.FIRST_RESERVED_FIELD_NUMBER, FieldDescriptor.LAST_RESERVED_FIELD_NUMBER + 1)
 
 
+def chosen_envelope(schema: ProtoSchema, choice: Mapping[str, Located[str]]) -> Envelope:
+    """Return the envelope of the schema. `choice` are the keys of the table that say how it holds payloads.
+
+    Raises TableError.
+    """
+    if "oneof" in choice:
+        return find_envelope(schema, choice["oneof"])
+    return framed_envelope(schema, choice["case"])
+
+
+def framed_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
+    """Return an envelope that is the payload itself; `named` is the name of its only case. Raises TableError."""
+    message = schema.descriptor(schema.envelope)
+    if refused := list(undecidable(message, (), schema.place)):
+        raise TableError(refused)
+    size = largest_encoding(message, schema.board_options)
+    made = schema.message_class(schema.envelope)
+    case = PayloadCase(named.value, ONLY_CASE, schema.messages[schema.envelope], made, size, Wrapping(0))
+    return Envelope(schema.envelope, ByFrame(named.value), made, {case.name: case}, size or 0)
+
+
 def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     """Return the envelope of the schema, with its oneof `named`.
 
@@ -371,9 +403,9 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     options = {field.name: schema.board_options(field) for field in oneof.fields}
     # An unbounded case is only reported if it is sent to a board.
     bounded = [
-        framed_size(case.number, case.max_size)
+        case.max_frame
         for case in cases.values()
-        if case.max_size is not None and not options[case.name].is_ignored
+        if case.max_frame is not None and not options[case.name].is_ignored
     ]
     sizes = (member_size(field, schema.board_options) for field in others)
     bounded += [size for size in sizes if size is not None]
@@ -385,7 +417,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     }
     beside = tuple(member for member in schema.messages[name].fields if member.oneof != oneof.name)
     return Envelope(
-        name, oneof.name, schema.message_class(name), cases, max_size, unroutable, MessageType(name, beside)
+        name, ByOneof(oneof.name), schema.message_class(name), cases, max_size, unroutable, MessageType(name, beside)
     )
 
 

@@ -46,7 +46,8 @@ class Maker:
 
     def envelope(self) -> bytes:
         self._room = self._noise.choice((5, 30, 120))
-        oneof = [field for field in self._envelope.fields if field.containing_oneof is not None]
+        fields = self._envelope.fields
+        oneof = [field for field in fields if field.containing_oneof is not None] or fields
         parts = [self._known(self._noise.choice(oneof)) for _ in range(self._noise.choice((0, 1, 1, 1, 1, 1, 2)))]
         if self._noise.random() < 0.3:
             parts.append(self._message(self._envelope))

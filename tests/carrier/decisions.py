@@ -20,7 +20,7 @@ from tests.tables import PROTOS
 TESTS = Path(__file__).parents[1]
 
 HEAD = """version: 1
-envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
+envelope: {protos: PROTOS, message: PBEnvelope, CHOICE}
 listen:
   trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}
   exact: {address: 127.0.0.1:5001, framing: exact}
@@ -30,12 +30,14 @@ endpoints:
 routes:
 """
 
+HARD = TESTS / "carrier" / "protos"
 SCHEMAS = {
-    "rover": (PROTOS, ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
-    "every_kind": (TESTS / "protos", ["every_kind"]),
-    "hard": (TESTS / "carrier" / "protos", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
+    "rover": (PROTOS, "oneof: payload", ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
+    "every_kind": (TESTS / "protos", "oneof: payload", ["every_kind"]),
+    "hard": (HARD, "oneof: payload", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
+    "frame": (HARD, "case: frame", ["frame"]),
 }
-"""Folders of protos, and the payload cases with a route."""
+"""Folders of protos, how the envelope says which message it holds, and the payload cases with a route."""
 
 
 def native_library() -> ctypes.CDLL:
@@ -47,11 +49,11 @@ def native_library() -> ctypes.CDLL:
 
 def table(schema: str, folder: Path) -> CompiledTable:
     """A table for one of SCHEMAS, written to a new folder in `folder`, because the oracle reads the file again."""
-    protos, cases = SCHEMAS[schema]
+    protos, choice, cases = SCHEMAS[schema]
     routes = "".join(f"  {case}: {{source: any, destinations: [tool]}}\n" for case in cases)
     own = folder / schema
     own.mkdir(exist_ok=True)
-    return program(own, routes, HEAD, protos)
+    return program(own, routes, HEAD.replace("CHOICE", choice), protos)
 
 
 class CarrierSide:

@@ -23,6 +23,7 @@ from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint
 from tests.oracles.envelopes import Decision, decide
 from tests.small_tables import program
 
+ONEOF_HEAD = HEAD.replace("CHOICE", "oneof: payload")
 Sides = tuple[CompiledTable, CarrierSide]
 
 
@@ -46,10 +47,10 @@ def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
         assert payload.is_single or read_varint(found, 0)[0] == case.number << 3 | LEN
         try:
             alone = case.message_class.FromString(found) if payload.is_single else getattr(parse(found), case.name)
-            envelope = parse(carrier.whole())
+            ((_, held),) = made.envelope.payloads_of(parse(carrier.whole()))
         except DecodeError:  # one level too deep for the envelope
             return decision
-        assert alone.SerializePartialToString() == getattr(envelope, case.name).SerializePartialToString()
+        assert alone.SerializePartialToString() == held.SerializePartialToString()
     return decision
 
 
@@ -220,7 +221,7 @@ def test_what_it_cannot_decide_is_a_finding(tmp_path: Path, fields: str, complai
         f"message PBEnvelope {{ {fields} }}"
     )
     table = tmp_path / "table.yaml"
-    table.write_text(HEAD.removesuffix("routes:\n").replace("PROTOS", str(tmp_path)) + "routes: {}\n")
+    table.write_text(ONEOF_HEAD.removesuffix("routes:\n").replace("PROTOS", str(tmp_path)) + "routes: {}\n")
     [finding] = [each for each in check_table(table).diagnostics if each.code is Code.BAD_PROTO]
     assert complaint in finding.message
     assert finding.span.file.endswith(("envelope.proto", "old.proto"))
@@ -233,7 +234,8 @@ def test_what_is_beside_the_payload_is_known_whatever_it_holds(library: ctypes.C
         "message PBEnvelope { oneof payload { Case case = 1; } Closed closed = 2; repeated Closed all = 3;"
         " map<int32, Closed> map = 4; }"
     )
-    side = CarrierSide(library, program(tmp_path, "  case: {source: any, destinations: [tool]}\n", HEAD, tmp_path))
+    routes = "  case: {source: any, destinations: [tool]}\n"
+    side = CarrierSide(library, program(tmp_path, routes, ONEOF_HEAD, tmp_path))
     for beside in (b"\x10\x07", b"\x1a\x01\x07", framed(4, b"\x08\x01\x10\x07")):
         assert side.decide(beside, repairs=False) == Decision("no_payload", 0, False)
         assert side.decide(beside + framed(1, b""), repairs=False) == Decision(None, 1, False)

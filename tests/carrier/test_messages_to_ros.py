@@ -94,7 +94,7 @@ def _assert_allowed(library: CDLL, reading: CarrierSide, program: CompiledTable,
             noise.shuffle(parts)
             whole = b"".join(parts)
             parsed: Any = envelope.message_class.FromString(whole)
-            if parsed.WhichOneof(envelope.oneof) == case.name:
+            if parsed.WhichOneof(envelope.choice.oneof) == case.name:
                 reading.decide(whole, repairs=False)
                 check(whole, getattr(parsed, case.name), reading.payload())
 

@@ -141,7 +141,7 @@ def made(case: str, fields: FieldMap, /, **given: tuple[Type, Any]) -> Any:
     datagram = compiled_envelope(wire, declared, fields, source)(message)
     assert_same_bytes(wire, datagram, reference_envelope(wire, declared, fields, source)(message))
     parsed = wire[1].message_class.FromString(datagram)
-    assert parsed.WhichOneof(wire[1].oneof) == case
+    assert parsed.WhichOneof(wire[1].choice.oneof) == case
     assert_same_bytes(wire, parsed.SerializeToString(), datagram)
     return getattr(parsed, case)
 

@@ -10,6 +10,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
+from router.types.case_by import ByFrame
 from router.types.framing import restored
 from router.types.protobuf import Envelope
 from router.types.wire import LEN
@@ -34,16 +35,18 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     """The decision about `data`, of at most `most` bytes. `routed` are the payload cases with a route."""
     if len(data) > most:
         return Decision("truncated", 0, False)
-    if not data:
-        return Decision("empty", 0, False)
     whole = restored(data) if repairs else data
     try:
         parsed: Message = envelope.message_class.FromString(whole)
     except DecodeError:
-        number = _only_payload(envelope, routed, data)
+        number = None if isinstance(envelope.choice, ByFrame) else _only_payload(envelope, routed, data)
         return Decision(None, number, False) if number else Decision("malformed", 0, False)
     is_repaired = len(whole) != len(data)
-    if name := parsed.WhichOneof(envelope.oneof):
+    if isinstance(envelope.choice, ByFrame):
+        return Decision(None, envelope.numbers[envelope.choice.case], is_repaired)
+    if not data:
+        return Decision("empty", 0, False)
+    if name := parsed.WhichOneof(envelope.choice.oneof):
         return Decision(None, envelope.numbers[name], is_repaired, _superseded(envelope, whole))
     fields = UnknownFieldSet(parsed)
     unknown = [fields[index].field_number for index in range(len(fields))]

@@ -9,7 +9,8 @@ from hypothesis import given
 
 from router.compiler import check_table
 from router.declared import MAX_DATAGRAM
-from router.recording.mirror import Classifier, payload_number
+from router.recording.mirror import Classifier
+from router.types.case_by import ByOneof
 from router.types.protobuf import PayloadCase
 from tests.envelopes import I32, I64, LEN, VARINT, framed, tag
 from tests.observe.fake_running import sim_program
@@ -31,21 +32,21 @@ def case_in(data: bytes, known: Classifier = KNOWN, listener: str = "rover") -> 
 @pytest.mark.parametrize("case", PROGRAM.envelope.cases.values(), ids=lambda case: case.name)
 def test_the_case_is_found_without_parsing(case: PayloadCase) -> None:
     data = PROGRAM.envelope.message_class(**{case.name: {}}).SerializeToString()
-    assert payload_number(data, NUMBERS) == case.number
+    assert ByOneof("payload").first_number(data, NUMBERS) == case.number
     assert KNOWN.payload("rover", data) == (case, case.message_class())
 
 
 @pytest.mark.parametrize("data", [b"", b"\x80", b"\xff\xff\xff"])
 def test_what_begins_with_no_tag_has_no_payload(data: bytes) -> None:
-    assert payload_number(data, NUMBERS) == 0
+    assert ByOneof("payload").first_number(data, NUMBERS) == 0
     assert case_in(data) is None
 
 
 @pytest.mark.parametrize("before", [b"", *(tag(20, kind) + value for kind, value in VALUES.items())])
 def test_a_payload_is_found_behind_other_fields_of_the_envelope(before: bytes) -> None:
     for number in (1, 16, 2047, 2048, 2**29 - 1):
-        assert payload_number(before + framed(number, b"x"), {number}) == number
-    assert payload_number(before + framed(17, b"x"), {16}) == 0
+        assert ByOneof("payload").first_number(before + framed(number, b"x"), {number}) == number
+    assert ByOneof("payload").first_number(before + framed(17, b"x"), {16}) == 0
 
 
 @given(datagrams())

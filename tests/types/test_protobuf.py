@@ -117,7 +117,7 @@ def test_envelope_cases_have_number_type_class_and_size(load: Load) -> None:
     assert (imu.number, imu.type.name, imu.max_size) == (13, "Imu", 5)
     assert (note.number, note.type.name, note.max_size) == (2, "Note", None)
     assert imu.message_class.DESCRIPTOR.full_name == "Imu"
-    assert (found.name, found.oneof, found.max_size) == ("Envelope", "payload", 7)
+    assert (found.name, found.choice.oneof, found.max_size) == ("Envelope", "payload", 7)
 
 
 def test_envelope_size_counts_what_stands_beside_the_oneof(load: Load) -> None:

@@ -54,7 +54,7 @@ def test_golden_envelope_decodes_to_the_listed_values_and_they_encode_to_it(
     envelope: Envelope, entry: Mapping[str, Any]
 ) -> None:
     message = envelope.message_class.FromString(bytes.fromhex(entry["hex"]))
-    assert message.WhichOneof(envelope.oneof) == entry["payload_case"]
+    assert message.WhichOneof(envelope.choice.oneof) == entry["payload_case"]
     case = envelope.cases[entry["payload_case"]]
     assert (case.number, case.type.name) == (entry["field_number"], entry["message"])
     payload = getattr(message, case.name)

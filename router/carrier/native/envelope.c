@@ -3,29 +3,13 @@
  * A field whose number or wire type is not declared is unknown: it is skipped, but must be well formed. */
 #include "envelope.h"
 
+#include "find_case.h"
 #include "utf8.h"
 #include "wire.h"
 
 #include <string.h>
 
 enum { MOST_LEVELS = 100 /* of nested messages and groups, known or unknown */ };
-
-static const struct wire_field *find_field(const struct wire_type *type, uint32_t number) {
-    const struct wire_field *fields = type->fields;
-    /* Most types number their fields from 1 without gaps. For number 0 the index wraps around. */
-    if (number - 1 < type->count && fields[number - 1].number == number) return &fields[number - 1];
-    uint32_t low = 0, high = type->count;
-    while (low < high) {
-        uint32_t middle = low + (high - low) / 2;
-        if (fields[middle].number == number) return &fields[middle];
-        if (fields[middle].number < number) {
-            low = middle + 1;
-        } else {
-            high = middle;
-        }
-    }
-    return NULL;
-}
 
 /* Whether packed scalars are whole. */
 static bool is_packed(uint8_t kind, struct bytes values) {
@@ -66,7 +50,7 @@ static void leave(struct walk *walk) { walk->rest.end = walk->levels[--walk->dep
 static bool read_known_len(struct walk *walk, const struct wire_type *type, uint32_t number) {
     struct bytes value;
     if (!read_len(&walk->rest, &value)) return false;
-    const struct wire_field *field = type ? find_field(type, number) : NULL;
+    const struct wire_field *field = type ? find_wire_field(type, number) : NULL;
     if (field == NULL) return true;
     if (field->kind == WIRE_MESSAGE) {
         walk->rest.at = value.at;
@@ -78,7 +62,7 @@ static bool read_known_len(struct walk *walk, const struct wire_type *type, uint
 }
 
 static bool enter_group(struct walk *walk, const struct wire_type *type, uint32_t number) {
-    const struct wire_field *field = type ? find_field(type, number) : NULL;
+    const struct wire_field *field = type ? find_wire_field(type, number) : NULL;
     bool is_known = field != NULL && field->kind == WIRE_GROUP;
     return enter(walk, walk->rest.end, is_known ? &walk->schema->types[field->type] : NULL, number);
 }
@@ -129,61 +113,13 @@ static bool is_well_formed(const struct wire_schema *schema, const struct wire_t
     }
 }
 
-/* Whether an envelope's field has the declared wire type. */
-static bool is_known(const struct wire_field *field, uint32_t wire_type) {
-    if (field == NULL) return false;
-    switch (wire_type) {
-    case VARINT: return field->kind == WIRE_VARINT;
-    case I64: return field->kind == WIRE_I64;
-    case I32: return field->kind == WIRE_I32;
-    case GROUP: return field->kind == WIRE_GROUP;
-    default:
-        return field->kind == WIRE_BYTES || field->kind == WIRE_STRING || field->kind == WIRE_MESSAGE ||
-               (field->flags & WIRE_PACKABLE) != 0;
-    }
-}
-
-/* Find the payload case of a well-formed envelope: the last member of its oneof. */
-static int find_case(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
-    struct bytes rest = {data, data + envelope->size};
-    uint32_t pieces = 0, unknown = 0, no_message = 0, first = 0;
-    bool has_unknown = false;
-    while (rest.at < rest.end) {
-        uint32_t tag, begin = (uint32_t)(rest.at - data);
-        struct bytes value;
-        if (!read_tag(&rest, &tag) || !read_value(&rest, tag & 7, &value)) return MALFORMED;
-        uint32_t number = tag >> 3, wire_type = tag & 7;
-        const struct wire_field *field = find_field(&schema->types[0], number);
-        bool is_case = field != NULL && (field->flags & WIRE_CASE);
-        if (is_case && is_known(field, wire_type)) {
-            pieces = number == envelope->case_number ? pieces + 1 : 1;
-            if (pieces == 1) first = begin;
-            if (pieces == 1 && envelope->case_number != 0) envelope->superseded++;
-            envelope->case_number = number;
-            envelope->start = pieces == 1 ? (uint32_t)(value.at - data) : first;
-            envelope->length = (uint32_t)(value.end - data) - envelope->start;
-        } else if (!is_known(field, wire_type)) {
-            if (!has_unknown) unknown = number;
-            has_unknown = true;
-            if (is_case && field->kind == WIRE_MESSAGE && no_message == 0) no_message = number;
-        }
-    }
-    if (envelope->case_number != 0) {
-        envelope->is_single = pieces == 1;
-        return -1;
-    }
-    if (!has_unknown) return NO_PAYLOAD;
-    envelope->case_number = no_message ? no_message : unknown;
-    return no_message ? MALFORMED : UNKNOWN_CASE;
-}
-
 /* Whether the datagram contains only the payload of a routed case, with a tag and a size of at most two bytes, as usual. The
  * payload is then parsed alone, and may have one level more than within the envelope. */
 static bool is_usual(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
     struct bytes rest = {data, data + envelope->size};
     uint64_t tag, size;
     if (!read_varint(&rest, 2, &tag) || (tag & 7) != LEN) return false;
-    const struct wire_field *field = find_field(&schema->types[0], (uint32_t)tag >> 3);
+    const struct wire_field *field = find_wire_field(&schema->types[0], (uint32_t)tag >> 3);
     if (field == NULL || !(field->flags & WIRE_ROUTED)) return false;
     if (!read_varint(&rest, 2, &size) || size != left(&rest)) return false;
     if (!is_well_formed(schema, &schema->types[field->type], rest)) return false;
@@ -230,16 +166,20 @@ size_t envelope_restored_size(const uint8_t *data, size_t size) {
     return size;
 }
 
+static int (*const FIND_CASE[])(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope) = {
+    [BY_ONEOF] = find_by_oneof,
+    [BY_FRAME] = find_by_frame,
+};
+
 int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, bool repairs,
                   struct envelope *envelope) {
     *envelope = (struct envelope){.size = (uint32_t)size};
     if (size > MAX_DATAGRAM) return TRUNCATED;
-    if (size == 0) return EMPTY;
     if (is_usual(schema, data, envelope)) return -1;
     size_t whole = repairs ? envelope_restored_size(data, size) : size;
     if (whole > size) memset(data + size, 0, whole - size);
     if (!is_well_formed(schema, &schema->types[0], (struct bytes){data, data + whole})) return MALFORMED;
     envelope->size = (uint32_t)whole;
     envelope->is_repaired = whole != size;
-    return find_case(schema, data, envelope);
+    return FIND_CASE[schema->case_by](schema, data, envelope);
 }

@@ -1,5 +1,5 @@
-/* Finds the payload case of a datagram: repairs the framing, and decides whether the envelope is well formed, with the same
- * result as the protobuf library. */
+/* Finds the payload case of a datagram: repairs the framing, decides whether the envelope is well formed, with the same result
+ * as the protobuf library, and which message it holds (find_case.h). */
 #ifndef ENVELOPE_H
 #define ENVELOPE_H
 
@@ -7,36 +7,13 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "wire_schema.h"
+
 enum { MAX_DATAGRAM = 16 * 1024 }; /* bytes; a longer datagram is rejected as TRUNCATED */
 
 /* Reasons to reject a datagram: REJECT_REASONS in compiler/metrics.py. */
 enum reason { TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD, UNKNOWN_CASE, UNHANDLED, IGNORED, SOURCE_MISMATCH };
 enum { REASONS = SOURCE_MISMATCH + 1 };
-
-/* The message types of an envelope, flattened by carrier/schema.py. */
-struct wire_field {
-    uint32_t number;
-    uint8_t kind;  /* one of enum wire_kind */
-    uint8_t flags; /* of enum wire_flag */
-    uint16_t type; /* for a message or group: index of its type */
-};
-enum wire_kind { WIRE_VARINT, WIRE_I64, WIRE_I32, WIRE_BYTES, WIRE_STRING, WIRE_MESSAGE, WIRE_GROUP };
-enum wire_flag {
-    WIRE_PACKABLE = 1, /* a repeated scalar: its elements may be packed or not */
-    WIRE_CASE = 2,     /* in the envelope: a member of the oneof of payloads */
-    WIRE_ROUTED = 4,   /* a member that has a route, which is always a message */
-};
-
-struct wire_type {
-    const struct wire_field *fields; /* by ascending number */
-    uint32_t count;
-    uint32_t accepts_zero; /* field number 0 is allowed, as in messages that declare no fields */
-};
-
-struct wire_schema {
-    const struct wire_type *types; /* the first one is the envelope */
-    uint32_t count;
-};
 
 struct envelope {
     uint32_t case_number;

@@ -41,12 +41,20 @@ struct choice {
     uint32_t received; /* counter */
 };
 
-/* A field of the envelope's oneof. */
+/* A payload case of an envelope. */
 struct payload_case {
     uint32_t number;
     int32_t row;        /* of the listener's choices; -1 for a case without a route */
     uint32_t is_ignored;
     uint32_t unhandled; /* counter */
+};
+
+/* An envelope: what the frames of a listener are. */
+struct protocol {
+    struct wire_schema schema;
+    const struct payload_case *cases; /* by number */
+    uint32_t case_count;
+    uint32_t unknown_case; /* counter */
 };
 
 /* An endpoint, as a listener identifies it. */
@@ -65,6 +73,7 @@ struct listener {
     uint32_t id; /* in events and mirror records */
     uint32_t repairs;
     uint32_t keeps_input; /* datagrams queued at the stop are left for the next process */
+    const struct protocol *protocol;
     const struct peer *peers; /* by address; for one address, those with a port first */
     const struct choice *choices; /* `columns` for each row; the last one is for strangers */
     uint32_t peer_count, columns;
@@ -73,13 +82,9 @@ struct listener {
 
 struct program {
     uint32_t generation;
-    uint32_t listener_count, case_count;
-    uint32_t unknown_case; /* counter */
-    uint32_t state_count, reserved;
+    uint32_t listener_count, state_count;
     const struct state_settings *states;
-    const struct wire_schema *schema;
     const struct listener *listeners;
-    const struct payload_case *cases; /* by number */
     const struct route *routes;
 };
 

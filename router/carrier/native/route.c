@@ -179,16 +179,16 @@ static const struct peer *find_peer(const struct listener *listener, uint32_t ad
     return NULL;
 }
 
-static const struct payload_case *find_case(const struct program *program, uint32_t number) {
+static const struct payload_case *find_case(const struct protocol *protocol, uint32_t number) {
     /* Most envelopes number their cases from 1 without gaps. */
-    if (number - 1 < program->case_count && program->cases[number - 1].number == number) return &program->cases[number - 1];
-    uint32_t low = 0, high = program->case_count;
+    if (number - 1 < protocol->case_count && protocol->cases[number - 1].number == number) return &protocol->cases[number - 1];
+    uint32_t low = 0, high = protocol->case_count;
     while (low < high) {
         uint32_t middle = (low + high) / 2;
-        if (program->cases[middle].number < number) low = middle + 1;
+        if (protocol->cases[middle].number < number) low = middle + 1;
         else high = middle;
     }
-    return &program->cases[low]; /* envelope_read returns no other number */
+    return &protocol->cases[low]; /* envelope_read returns no other number */
 }
 
 /* Route a datagram. Return ROUTED, or the reason for rejecting it. */
@@ -253,12 +253,13 @@ int route_datagram(struct routing *routing, struct received *received) {
     received->column = received->peer ? received->peer->column : listener->columns - 1;
     received->route = NULL;
     if (received->peer) hear(routing, received);
-    int reason = envelope_read(routing->program->schema, routing->datagram, received->length, listener->repairs,
+    const struct protocol *protocol = listener->protocol;
+    int reason = envelope_read(&protocol->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
     if (received->envelope.is_repaired) env_count(&routing->env, listener->padded, 1);
     if (received->envelope.superseded) report_superseded(routing, received);
-    if (reason == UNKNOWN_CASE) env_count(&routing->env, routing->program->unknown_case, 1);
-    if (reason == ROUTED) reason = route(routing, find_case(routing->program, received->envelope.case_number), received);
+    if (reason == UNKNOWN_CASE) env_count(&routing->env, protocol->unknown_case, 1);
+    if (reason == ROUTED) reason = route(routing, find_case(protocol, received->envelope.case_number), received);
     if (reason != ROUTED) reject(routing, received, (enum reason)reason);
     return reason;
 }

@@ -30,7 +30,8 @@ def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase, beside
     place = Place(plan.span, "")
     inside = _Writer(lowering).record(plan, descriptor, "")
     before = at(place, known(beside)) if beside else []
-    return list(merged([*before, *_delimited(case.number << 3 | LEN, inside, place)]))
+    tag = case.wrapping.tag
+    return list(merged([*before, *(_delimited(tag, inside, place) if tag else inside)]))
 
 
 def protobuf_fields(lowering: Lowering, plan: Record, descriptor: Descriptor) -> list[Placed]:

@@ -55,7 +55,12 @@ COMPLETE: Schema = {
         },
         "else": {"required": ["envelope", "listen", "routes"]},
         "properties": {
-            "envelope": {"required": ["message", "oneof"]},
+            "envelope": {
+                "required": ["message"],
+                "if": {"required": ["case"]},
+                "then": without("oneof", "is not allowed with 'case': with it, the datagram itself is the message"),
+                "else": {"required": ["oneof"]},
+            },
             "http": {"required": ["address"]},
             "record": {"required": required(RecordSettings)},
             "foxglove": {"required": ["address"]},

@@ -1,5 +1,6 @@
 """Settings of the table as a whole: envelope, node, servers, recording."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -30,11 +31,17 @@ class EnvelopeSettings:
     Title: Envelope message
     Example: PBEnvelope
     """
-    oneof: Located[str]
-    """The name of the envelope's oneof whose members are the payload cases.
+    oneof: Located[str] | None = None
+    """The name of the envelope's oneof whose members are the payload cases. Instead of it: `case`.
 
     Title: Payload oneof
     Example: payload
+    """
+    case: Annotated[Located[str] | None, Shape("node_name")] = None
+    """Instead of `oneof`: the datagram is itself the message of a single payload case, which gets this name.
+
+    Title: The only payload case
+    Example: referee
     """
     lock: Located[Path] | None = None
     """The file that records the field numbers, relative to this file. Default: envelope.lock.json in the folder of the
@@ -57,6 +64,12 @@ class EnvelopeSettings:
     Example: boards do not check the sequence number
     Error: must be a text that says why these fields may be empty
     """
+
+    @property
+    def choice(self) -> Mapping[str, Located[str]]:
+        """The keys that say how the envelope holds payloads: one of `oneof` and `case`."""
+        keys = {"oneof": self.oneof, "case": self.case}
+        return {name: value for name, value in keys.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,11 +36,14 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     declarations: list[str] = []
+    kinds: list[int] = []
     noise = random.Random(1)
     for index, schema in enumerate(SCHEMAS):
         made = table(schema, folder)
         memory = Arrays()
-        declarations += _arrays(index, write_schema(made.envelope, made.inbound, memory))
+        lowered = write_schema(made.envelope, made.inbound, memory)
+        declarations += _arrays(index, lowered)
+        kinds.append(lowered.case_by)
         maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
         if schema == "rover":
@@ -50,7 +53,7 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
             (corpus / f"{schema}-{number}-sent").write_bytes(b"!" + seed)  # for handle_fuzz
     declarations.append(f"enum {{ SCHEMA_COUNT = {len(SCHEMAS)} }};")
     schemas = ", ".join(
-        f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}}}" for index in range(len(SCHEMAS))
+        f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}, {by}}}" for index, by in enumerate(kinds)
     )
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")

@@ -55,8 +55,9 @@ static const struct peer peers[] = {
 static const struct choice choices[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];
 static struct listener listeners[LISTENERS];
-static struct program program = {.generation = 1, .listener_count = LISTENERS, .unknown_case = UNHANDLED_CASES,
-                                 .schema = &schemas[0], .listeners = listeners, .cases = cases, .routes = &only};
+static struct program program = {.generation = 1, .listener_count = LISTENERS,
+                                 .listeners = listeners, .routes = &only};
+static struct protocol protocol = {.cases = cases, .unknown_case = UNHANDLED_CASES};
 static struct carrier *carrier;
 
 static void demand(bool condition) {
@@ -65,18 +66,19 @@ static void demand(bool condition) {
 
 int LLVMFuzzerInitialize(int *count, char ***arguments) {
     (void)count, (void)arguments;
-    const struct wire_type *envelope = &schemas[0].types[0];
+    protocol.schema = schemas[0];
+    const struct wire_type *envelope = &protocol.schema.types[0];
     for (uint32_t index = 0; index < envelope->count; index++) {
         const struct wire_field *field = &envelope->fields[index];
         if (!(field->flags & WIRE_CASE)) continue;
-        demand(program.case_count < MOST_CASES);
-        cases[program.case_count++] = (struct payload_case){.number = field->number, .unhandled = UNHANDLED_CASES,
+        demand(protocol.case_count < MOST_CASES);
+        cases[protocol.case_count++] = (struct payload_case){.number = field->number, .unhandled = UNHANDLED_CASES,
                                                             .row = field->flags & WIRE_ROUTED ? 0 : -1,
                                                             .is_ignored = field->number % 2};
     }
     for (uint32_t index = 0; index < LISTENERS; index++) {
         uint32_t first = index * OF_LISTENER;
-        listeners[index] = (struct listener){.fd = -1, .repairs = index, .peers = peers, .choices = choices, .peer_count = 3,
+        listeners[index] = (struct listener){.fd = -1, .repairs = index, .protocol = &protocol, .peers = peers, .choices = choices, .peer_count = 3,
                                              .columns = COLUMNS, .received = first, .received_bytes = first + 1,
                                              .padded = first + 2, .superseded = first + 3};
         for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 4 + reason;

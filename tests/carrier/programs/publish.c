@@ -26,6 +26,7 @@ struct made {
     struct listener listener;
     struct choice choice;
     struct payload_case only;
+    struct protocol protocol;
     struct route route;
     struct target targets[TOPICS];
     struct topic topics[TOPICS];
@@ -50,7 +51,6 @@ struct round {
 static const struct wire_field of_envelope[] = {{1, WIRE_MESSAGE, WIRE_CASE | WIRE_ROUTED, 1}};
 static const struct wire_field of_payload[] = {{1, WIRE_VARINT, 0, 0}};
 static const struct wire_type types[] = {{of_envelope, 1, 0}, {of_payload, 1, 1}};
-static const struct wire_schema schema = {types, 2};
 
 static const uint8_t header[] = {0, 1, 0, 0};
 static struct limit limit = {1000, 500, -1000};
@@ -122,12 +122,13 @@ static struct made *make(const struct round *env, uint32_t generation) {
     made->route = (struct route){.publishes = publishes, .last_message = LAST, .duration = DURATION};
     made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
     made->choice = (struct choice){0, ACCEPTED};
-    made->listener = (struct listener){.fd = env->socket, .choices = &made->choice, .columns = 1, .received = RECEIVED,
+    made->protocol = (struct protocol){.schema = {.types = types, .count = 2}, .cases = &made->only, .case_count = 1,
+                                       .unknown_case = UNKNOWN};
+    made->listener = (struct listener){.fd = env->socket, .protocol = &made->protocol, .choices = &made->choice, .columns = 1, .received = RECEIVED,
                                        .received_bytes = BYTES, .padded = PADDED, .superseded = SUPERSEDED};
     for (int reason = 0; reason < REASONS; reason++) made->listener.rejected[reason] = (uint32_t)(REJECTED + reason);
-    made->program = (struct program){.generation = generation, .listener_count = 1, .case_count = 1,
-                                     .unknown_case = UNKNOWN, .schema = &schema, .listeners = &made->listener,
-                                     .cases = &made->only, .routes = &made->route};
+    made->program = (struct program){.generation = generation, .listener_count = 1,
+                                     .listeners = &made->listener, .routes = &made->route};
     return made;
 }
 

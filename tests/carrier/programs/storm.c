@@ -36,6 +36,7 @@ struct made {
     struct choice choices[ROUTES * 2]; /* columns: the known peer, strangers */
     struct peer peer;
     struct payload_case cases[ROUTES + 1];
+    struct protocol protocol;
     struct route routes[ROUTES];
     struct target destinations[ROUTES][DESTINATIONS];
     struct section section; /* of which no field is wanted */
@@ -53,7 +54,6 @@ static const struct wire_field of_envelope[] = {
     {1, WIRE_MESSAGE, WIRE_CASE | WIRE_ROUTED, 1}, {2, WIRE_MESSAGE, WIRE_CASE | WIRE_ROUTED, 1},
     {3, WIRE_MESSAGE, WIRE_CASE, 1}};
 static const struct wire_type types[] = {{of_envelope, 3, 0}, {NULL, 0, 1}};
-static const struct wire_schema schema = {types, 2};
 
 static counter counters[COUNTERS], braked[DEADMAN_COUNTERS];
 static struct ring *receive_events, *brake_events, *messages, *mirrored;
@@ -111,8 +111,8 @@ static uint32_t destination_counter(int route, int destination, int which) {
 }
 
 static struct listener make_listener(const struct made *made, int index) {
-    struct listener listener = {.fd = listening[index], .id = (uint32_t)index, .repairs = 1, .peers = &made->peer,
-                                .choices = made->choices, .peer_count = 1, .columns = 2,
+    struct listener listener = {.fd = listening[index], .id = (uint32_t)index, .repairs = 1, .protocol = &made->protocol,
+                                .peers = &made->peer, .choices = made->choices, .peer_count = 1, .columns = 2,
                                 .received = listener_counter(index, RECEIVED),
                                 .received_bytes = listener_counter(index, BYTES),
                                 .padded = listener_counter(index, PADDED),
@@ -170,9 +170,10 @@ static struct made *make(uint32_t generation) {
     made->peer = (struct peer){.address = 0x7f000002, .last_seen = SEEN, .heard_since = HEARD, .pause = INT64_MAX};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};
     for (int index = 0; index < ROUTES; index++) make_route(made, index);
+    made->protocol = (struct protocol){.schema = {.types = types, .count = 2}, .cases = made->cases,
+                                       .case_count = ROUTES + 1, .unknown_case = UNKNOWN};
     made->program = (struct program){.generation = generation, .listener_count = 1 + generation % LISTENERS,
-                                     .case_count = ROUTES + 1, .unknown_case = UNKNOWN, .schema = &schema,
-                                     .listeners = made->listeners, .cases = made->cases, .routes = made->routes};
+                                     .listeners = made->listeners, .routes = made->routes};
     for (uint32_t index = 0; index < made->program.listener_count; index++)
         made->listeners[index] = make_listener(made, (int)((index + generation / 2) % LISTENERS));
     return made;

@@ -1,0 +1,39 @@
+/* The message types of an envelope, flattened by image/wire_schema.py. */
+#ifndef WIRE_SCHEMA_H
+#define WIRE_SCHEMA_H
+
+#include <stdint.h>
+
+struct wire_field {
+    uint32_t number;
+    uint8_t kind;  /* one of enum wire_kind */
+    uint8_t flags; /* of enum wire_flag */
+    uint16_t type; /* for a message or group: index of its type */
+};
+enum wire_kind { WIRE_VARINT, WIRE_I64, WIRE_I32, WIRE_BYTES, WIRE_STRING, WIRE_MESSAGE, WIRE_GROUP };
+enum wire_flag {
+    WIRE_PACKABLE = 1, /* a repeated scalar: its elements may be packed or not */
+    WIRE_CASE = 2,     /* in the envelope: a field that is a payload case */
+    WIRE_ROUTED = 4,   /* a case that has a route, which is always a message */
+};
+
+struct wire_type {
+    const struct wire_field *fields; /* by ascending number */
+    uint32_t count;
+    uint32_t accepts_zero; /* field number 0 is allowed, as in messages that declare no fields */
+};
+
+/* How an envelope says which message it holds. */
+enum case_by {
+    BY_ONEOF, /* the member of a oneof */
+    BY_FRAME  /* the frame is the message of the only case, ONLY_CASE */
+};
+enum { ONLY_CASE = 1 };
+
+struct wire_schema {
+    const struct wire_type *types; /* the first one is the envelope */
+    uint32_t count;
+    uint32_t case_by;
+};
+
+#endif

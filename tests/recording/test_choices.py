@@ -1,0 +1,48 @@
+"""Recordings of each kind of envelope give back the datagrams, and their payloads without the table."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from router.compiler import check_table
+from router.compiler.compiled_table import CompiledTable
+from router.datagrams import Wire
+from router.recording.channels import Channels
+from router.recording.encoder import Packer
+from router.recording.mirror import SENT, Action, Classifier
+from router.recording.reader import Recorded, RecordedAction, Recording
+from router.recording.schemas import recorded_envelope
+from tests.recording.recorder_rig import START, Listed, shown, write
+
+TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
+
+FRAMED = [b"\x08\x02\x10\x02", b"", b"\x08\x03\x22\x07\x08\x00\x15", b"\x08\x03\0\0", b"\x22\x02\x08"]
+
+
+def program(table: str) -> CompiledTable:
+    made = check_table(TABLES / table, {}).program
+    assert made is not None
+    return made
+
+
+@pytest.mark.parametrize(("table", "datagrams"), [("framed.yaml", FRAMED)])
+def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tmp_path: Path) -> None:
+    made = program(table)
+    batch = [shown(data, START + number) for number, data in enumerate(datagrams)]
+    sent = [Action(START, SENT, "route", "board", data=datagrams[0])]
+    classifier = Classifier(made.envelope, made.table)
+    packed = Packer().pack(Listed(batch), Listed(sent), classifier, START, 0)
+    path = write(tmp_path / "it.mcap", Channels(), packed)
+    with closing(Recording(path)) as recording:
+        found = Wire(recorded_envelope(recording.cases()))
+        records = list(recording.everything())
+    assert [record.data for record in records if isinstance(record, Recorded)] == datagrams
+    assert [record.action.data for record in records if isinstance(record, RecordedAction)] == [datagrams[0]]
+    own = Wire(made.envelope)
+    for data in datagrams:
+        now, before = found.decode(data), own.decode(data)
+        assert now.case.name == before.case.name
+        assert now.message.SerializeToString() == before.message.SerializeToString()

@@ -1,0 +1,66 @@
+"""The lock file and `router new` for envelopes without a oneof."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+
+REFEREE = 'syntax = "proto3";\nmessage Referee { uint32 sequence = 1; }\n'
+TABLE = """version: 1
+envelope: {protos: protos, CHOICE}
+listen: {rover: {address: 127.0.0.1:5000}}
+endpoints: {board: {address: 127.0.0.2:8, kind: tool}}
+routes: {ROUTES}
+"""
+FRAME = "message: Referee, case: referee"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "protos").mkdir()
+    (tmp_path / "protos" / "a.proto").write_text(REFEREE)
+    return tmp_path
+
+
+def write_table(folder: Path, choice: str, case: str = "referee") -> None:
+    routes = f"{case}: {{source: any, destinations: [board]}}"
+    (folder / "table.yaml").write_text(TABLE.replace("CHOICE", choice).replace("ROUTES", routes))
+
+
+def test_the_lock_records_how_a_frame_holds_messages(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_table(folder, FRAME)
+    assert main(["validate", "--strict", "table.yaml"]) == BAD_TABLE
+    assert "create it with `router schema lock --table table.yaml`" in capsys.readouterr().out
+    assert main(["schema", "lock", "--table", "table.yaml"]) == OK
+    assert main(["validate", "--strict", "table.yaml"]) == OK
+    lock = json.loads((folder / "protos" / "envelope.lock.json").read_text())
+    assert lock["envelope"] == {"message": "Referee", "by": "frame", "max_size": 6}
+    write_table(folder, "message: Referee, case: judge", "judge")  # the name is not on the wire
+    assert main(["validate", "--strict", "table.yaml"]) == OK
+
+
+def test_another_message_is_a_conflict(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_table(folder, FRAME)
+    main(["schema", "lock", "--table", "table.yaml"])
+    (folder / "protos" / "a.proto").write_text(REFEREE + "message Other { Referee referee = 1; }\n")
+    write_table(folder, "message: Other, case: referee")
+    assert main(["validate", "table.yaml"]) == BAD_TABLE
+    assert "the lock is for the envelope Referee (by frame), not Other (by frame)" in capsys.readouterr().out
+
+
+def test_the_protos_alone_do_not_say_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_table(folder, FRAME)
+    main(["schema", "lock", "--table", "table.yaml"])
+    assert main(["schema", "lock", "--protos", "protos"]) == BAD_USAGE
+    assert "--table FILE" in capsys.readouterr().err
+
+
+def test_new_messages_are_members_of_a_oneof(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_table(folder, FRAME)
+    assert main(["new", "BoardState", "--number", "2", "--board", "board", "-t", "table.yaml"]) == BAD_USAGE
+    assert "an envelope without a oneof" in capsys.readouterr().err
