@@ -114,6 +114,7 @@ class Ledger:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected", "messages_waiting")
             fates = [self.total(metric, route, target.label) for metric in metrics]
-            if accepted != sum(fates):
+            split = self.total("messages_split", route, target.label)
+            if accepted + split != sum(fates):
                 kinds = "delivered, dropped, filtered, collected, waiting"
-                yield f"{route} to {target.label}: accepted {accepted}, but {kinds} {fates}"
+                yield f"{route} to {target.label}: accepted {accepted}, split {split}, but {kinds} {fates}"

@@ -19,6 +19,7 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 if TYPE_CHECKING:
+    from router.compiler.lowering.lowered import LoweredElements
     from router.compiler.lowering.operations import Routine
 
 
@@ -26,15 +27,17 @@ if TYPE_CHECKING:
 class Target:
     """A target of a route, as the table declares it, with the results of its check, and then its routines.
 
-    `endpoint` is set for a destination, `type` for a published topic. Without a `plan`, the datagram is forwarded
-    unchanged; `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each command to this
-    target feeds (its own route's) or disarms. `beside` is what `set` of the endpoint fills in messages with a plan.
+    `endpoint` is set for a destination, `type` for a published topic, `for_each` for one that gets each element of a
+    list. Without a `plan`, the datagram is forwarded unchanged; `rows` describe the mapping for `explain`. `deadmen`
+    are the routes whose deadmen each command to this target feeds (its own route's) or disarms. `beside` is what `set`
+    of the endpoint fills in messages with a plan.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
     without a `when`, or without a `plan`. `gate` is the part of the condition that reads only states, if messages may
-    be held: they must still meet it when they leave. `places` are the places of the table where a message may be
-    rejected, by `enum place` in `native/events.h`: the topic whose message cannot be read ("" for datagrams, which are
-    already checked), the condition, `for_each` or `collect`, and the field of each operation of `message`.
+    be held: they must still meet it when they leave. `elements` is `for_each` lowered. `places` are the places of the
+    table where a message may be rejected, by `enum place` in `native/events.h`: the topic whose message cannot be read
+    ("" for datagrams, which are already checked), the condition, `collect`, `for_each`, and the field of each operation
+    of `message`.
     """
 
     declared: Destination | Topic
@@ -46,9 +49,11 @@ class Target:
     declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
     beside: Beside | None = None
+    for_each: Node | None = None
     condition: Routine = ()
     gate: Routine = ()
     message: Routine = ()
+    elements: LoweredElements | None = None
     places: tuple[str, ...] = ()
 
     @property

@@ -106,7 +106,8 @@ def build(
         left = _left_out(ros_type, outcome.rows) if ros_type and not outcome.findings else []
         if left:
             names = ", ".join(f"'{name}'" for name in left[:_MOST_NAMES]) + ", ..." * (len(left) > _MOST_NAMES)
-            other = scope.message if ros_type == target else target
+            source = whole.kind.type if whole and isinstance(whole.kind, MessageKind) else scope.message
+            other = source if ros_type == target else target
             message = f"without 'fields', every field of {ros_type} needs a counterpart, but {other} has no {names}"
             hint = "map the fields, or write `fields: auto` to leave out those without a counterpart"
             outcome.findings.append(Diagnostic(span, Code.NOTHING_MAPPED, message, hint))

@@ -79,6 +79,12 @@ METRICS = (
         "messages_filtered", "counter", ("route", "target"), "Messages withheld by `when`, or without a subscriber."
     ),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
+    Metric(
+        "messages_split",
+        "counter",
+        ("route", "target"),
+        "Messages that the `for_each` of a topic adds: the elements of each list, except the first.",
+    ),
     Metric("messages_waiting", "level", ("route", "target"), "Messages queued between two threads of the router."),
     Metric(
         "publish_stalled_seconds",

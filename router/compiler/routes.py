@@ -11,7 +11,7 @@ from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.scope import field_of
-from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Variable
+from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable
 from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -63,7 +63,7 @@ def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
 
 
 _WITHOUT_ENVELOPE = {ENVELOPE: ("a message from ROS has no envelope", "name a field of the message")}
-_NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' need `for_each`, which this route lacks"
+_NO_FOR_EACH = f"'{ITEM}', '{INDEX}' and '{COUNT}' need `for_each`, which is missing here"
 _NO_COLLECT = f"'{ITEMS}' and '{COUNT}' need `collect`, which this route lacks"
 _COLLECT = "add `collect: {by: FIELD, count: FIELD, order: FIELD, timeout: 1s}`"
 
@@ -163,8 +163,8 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
             message = f"topic '{topic.topic.value}' is listed twice"
             lookup.report(topic.topic.span, Code.BAD_VALUE, message, "name it once")
         ros_type = lookup.ros_type(topic)
-        if ros_type is not None:
-            targets.append(_publish(lookup, route, case, topic, ros_type, names))
+        if ros_type is not None and (published := _publish(lookup, route, case, topic, ros_type, names)):
+            targets.append(published)
     collect = _collect(lookup, route, case, route.collect) if route.collect else None
     return CheckedRoute(route, case, tuple(targets), collect=collect)
 
@@ -180,14 +180,33 @@ def _forward(
 
 def _publish(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Node]
-) -> Target:
+) -> Target | None:
+    """Check a topic. Return None if the type of `item` is unknown: every use would be reported."""
     scope = lookup.received(case, ros_type, names, route)
     if not names:
         scope.absent = dict.fromkeys((ITEMS, COUNT), (_NO_COLLECT, _COLLECT))
+    for_each = None
+    if topic.for_each is not None:
+        for_each = _elements(lookup, topic.for_each, scope)
+        if for_each is None:
+            return None
+        if _element_type(for_each) is not None and not isinstance(for_each, (Read, Variable)):
+            message = f"'for_each' takes a {for_each.kind} from the datagram, not one that the table puts together"
+            lookup.report(for_each.span, Code.TYPE_MISMATCH, message, "name a field that is a list of messages")
+            return None
+        if topic.max_rate is not None and topic.when is None:
+            message = "of each list, 'max_rate' lets only the first element pass"
+            hint = "select one with `when`, as in item.id == 3; or publish the list in one message, with `each`"
+            lookup.report(topic.for_each.span, Code.BAD_VALUE, message, hint)
+        absent = {} if names else {ITEMS: scope.absent[ITEMS]}
+        scope = replace(scope, names=names | _element_names(for_each), absent=absent)
+    else:
+        scope.absent = {**_without_for_each(case.type), **scope.absent}
     when = lookup.when(topic.when, scope)
-    mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
+    whole = scope.variable(ITEM, topic.span) if for_each else None
+    mapping = build(topic.fields, ros_type, scope, topic.topic.span, whole, ros_type)
     lookup.findings += mapping.findings
-    return Target(topic, type=ros_type, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
+    return Target(topic, type=ros_type, for_each=for_each, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:

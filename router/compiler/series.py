@@ -111,6 +111,8 @@ def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
         _open(counters, delivered, route, target.label)
         if target.is_topic and plan.collect_timeout is not None:
             counters.index("messages_collected", route, target.label)
+        if target.for_each is not None:
+            counters.index("messages_split", route, target.label)
 
 
 def _open_state(counters: Counters, plan: StatePlan) -> None:

@@ -54,12 +54,14 @@ def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: li
         name = case.type.name.rpartition(".")[2]
         if topic.type is not None:
             return topic
-        if table.package is not None:
+        if table.package is not None and topic.for_each is None:
             return replace(topic, type=Located(f"{table.package.value}/msg/{name}", topic.topic.span))
         if "package" in table.broken:
             return topic
         message = f"the topic '{topic.topic.value}' lacks the key 'type'"
         hint = f"add it, or set `defaults: {{package: PACKAGE}}`, which makes it PACKAGE/msg/{name}"
+        if topic.for_each is not None:
+            hint = "add it: with `for_each`, it has no default"
         findings.append(Diagnostic(topic.topic.span, Code.MISSING_KEY, message, hint))
         return topic
 

@@ -10,7 +10,7 @@ from typing import Any
 from router import declared as c
 from router.compiler.checked import Target
 from router.compiler.compiled_table import STRANGER, Beside, CompiledTable, RoutePlan, StatePlan, source_label
-from router.compiler.lowering import LoweredCollect, LoweredRoute
+from router.compiler.lowering import LoweredCollect, LoweredElements, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.routines import Routines, native_values
@@ -154,6 +154,9 @@ class TargetWriter:
         written.filtered = counters.index("messages_filtered", *place)
         if target.is_topic and plan.collect_timeout is not None:
             written.collected = counters.index("messages_collected", *place)
+        if routines is not None and target.elements is not None:
+            written.for_each = ctypes.pointer(self.arrays.add(write_for_each(target.elements, routines)))
+            written.split = counters.index("messages_split", *place)
         written.delivered = counters.index("messages_published" if target.is_topic else "datagrams_sent", *place)
         written.dropped[:] = [counters.index("messages_dropped", *place, reason) for reason in DROP_REASON_NAMES]
         if not target.is_topic:
@@ -237,6 +240,20 @@ def write_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence
         signs=lowered.signs,
         items=lowered.items,
         counted=lowered.counted,
+    )
+
+
+def write_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
+    """Write `for_each`; empty if there is none."""
+    if elements is None:
+        return c.ForEach()
+    return c.ForEach(
+        list=routines.routine(elements.routine),
+        stored=elements.scalar,
+        section=elements.section,
+        item=elements.item,
+        index=elements.index,
+        count=elements.count,
     )
 
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 from router import declared as c
 from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, RoutePlan, source_label
-from router.compiler.lowering import LoweredElements, LoweredFeed
+from router.compiler.lowering import LoweredFeed
 from router.compiler.lowering.arrays import Arrays
-from router.compiler.lowering.routines import Routines
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers, sent_from
 from router.compiler.refusals import REJECTIONS
@@ -23,7 +22,7 @@ from router.image.image import Image
 from router.image.memory import Memory, Symbols, address_in
 from router.image.names import Names
 from router.image.openings import Openings
-from router.image.targets import TargetWriter, Timer
+from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
 from router.table.model.endpoints import Endpoint, EndpointKind, Framing
 
@@ -272,18 +271,4 @@ def _ros_route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.Ro
         received=counters.index("messages_received", plan.route, plan.topic),
         last_message=counters.index("route_silence_seconds", plan.route),
         duration=counters.index("route_duration_seconds", plan.route),
-    )
-
-
-def write_for_each(elements: LoweredElements | None, routines: Routines) -> c.ForEach:
-    """Write the `for_each` of a route; empty if it has none."""
-    if elements is None:
-        return c.ForEach()
-    return c.ForEach(
-        list=routines.routine(elements.routine),
-        stored=elements.scalar,
-        section=elements.section,
-        item=elements.item,
-        index=elements.index,
-        count=elements.count,
     )

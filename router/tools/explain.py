@@ -196,6 +196,8 @@ def _topic(served: Target, topic: Topic, route: Route) -> Iterator[str]:
 def _conditions(served: Target, route: Route) -> Iterator[str]:
     """Yield what decides whether a target gets a message."""
     words = phrases(served.declared)
+    if split := words.get("for_each"):
+        yield f"    {split}"
     if when := words.get("when"):
         yield f"    {when}"
     if age := phrases(route).get("ttl"):

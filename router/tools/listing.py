@@ -104,15 +104,17 @@ def _step(step: ReadOperation, layout: Layout) -> str:
 
 
 def _target(kind: str, target: Target, layout: Layout) -> Iterator[str]:
+    if target.elements is not None:
+        yield from _for_each(target.elements, layout, target)
     yield ""
     yield f"  {kind} {target.label}"
-    _, when, _, *places = target.places
+    _, when, _, _, *places = target.places
     yield from _listed(target.condition, [when] * len(target.condition), layout)
     yield from _listed(target.message, places, layout)
 
 
 def _for_each(elements: LoweredElements, layout: Layout, target: Target) -> Iterator[str]:
-    _, _, place, *_ = target.places
+    _, _, _, place, *_ = target.places
     yield ""
     yield f"  elements, {_stored(elements.scalar)}"
     yield from _listed(elements.routine, [place] * len(elements.routine), layout)

@@ -17,8 +17,7 @@ from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.refusals import DROP_REASON_NAMES
 from router.declared import NONE
-from router.image.targets import write_collect
-from router.image.writer import write_for_each
+from router.image.targets import write_collect, write_for_each
 from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"

@@ -120,6 +120,37 @@ def test_each_message_comes_to_what_it_comes_to_on_the_stage(opened: Open) -> No
     assert publishing.count("messages_filtered", "gps_info", "position") == 2
 
 
+SPLIT = f"""\
+  imu_info:
+    source: any
+    topics:
+      - {{topic: each, for_each: "[accel_x, accel_y, 9 / accel_z]", when: item != 5, {_FLOAT}10 / item}}}}
+      - {{topic: whole, type: std_msgs/msg/Int32, fields: {{data: round(accel_z)}}}}
+"""
+
+
+def test_the_elements_of_a_list_come_to_what_they_come_to_on_the_stage(opened: Open) -> None:
+    publishing = opened(SPLIT)
+    compare(publishing, imu(), imu(y=0.0), imu(x=5.0), imu(z=0.0))
+    route = "imu_info", "each"
+    assert publishing.count("messages_received") == 4
+    assert publishing.count("messages_split", *route) == 6
+    assert publishing.count("messages_published", *route) == 7
+    assert publishing.count("messages_filtered", *route) == 1
+    assert publishing.count("messages_dropped", *route, "mapping_error") == 2
+
+
+def test_books_balance_between_the_elements_of_a_list(opened: Open) -> None:
+    publishing = opened(SPLIT)
+    each = publishing.publishers["each"]
+    each.impede(delay_us=20_000)
+    publishing.send(imu(), imu(2.0))
+    while publishing.count("messages_waiting"):
+        assert list(publishing.ledger().imbalances()) == []
+    check_books(publishing)
+    assert publishing.count("messages_published", "imu_info", "each") == 6
+
+
 def test_an_envelope_may_have_several_fields_and_lack_its_zeros(opened: Open) -> None:
     parts = imu(1.0, 2.0, 3.0), imu(5.0, 0.0, 0.0)
     compare(opened(), gps(3.0) + imu(), imu() + gps(9.0), parts[0] + parts[1], parts[1] + parts[0])

@@ -26,7 +26,7 @@ topic: a
           twist.angular: {y: float32(accel_y)}
 """,
     )
-    nothing, condition, elements, *operations = target.places
+    nothing, condition, _, elements, *operations = target.places
     assert (nothing, condition, elements) == ("", "table.yaml:12:15: when", "")
     placed = dict(zip([each.kind for each in target.message], operations, strict=True))
     assert placed[Op.REAL_DIVIDE] == "table.yaml:14:27: twist.linear.x"
@@ -35,7 +35,7 @@ topic: a
 
 def test_without_a_condition_there_is_no_place_for_it(check_text: CheckText) -> None:
     target = lowered(check_text, "{topic: a, type: std_msgs/msg/Float32, fields: {data: accel_x}}")
-    assert target.places[:3] == ("", "", "")
+    assert target.places[:4] == ("", "", "", "")
 
 
 def test_elements_of_lists_have_places_of_their_own(check_text: CheckText) -> None:
@@ -48,7 +48,7 @@ topic: a
           orientation_covariance: [0, 0, 0, 0, 1 / accel_x, 0, 0, 0, sqrt(accel_y)]
 """,
     )
-    placed = dict(zip([each.kind for each in target.message], target.places[3:], strict=True))
+    placed = dict(zip([each.kind for each in target.message], target.places[4:], strict=True))
     assert placed[Op.REAL_DIVIDE] == "table.yaml:13:48: orientation_covariance"
     assert placed[Op.SQRT] == "table.yaml:13:70: orientation_covariance"
 

@@ -179,7 +179,7 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (GOOD, "ignore: nobody", "source: any, ignore: nobody", "source: any", "is not allowed with 'ignore'"),
         (GOOD, "max_rate: 20 Hz, ", "", "on_limit: latest", "needs 'max_rate'"),
         (GOOD, "{none: nothing moves because of it}", "500ms", "deadman: 500ms", "{none: why} if there is none"),
-        (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "allowed only if the source is a topic"),
+        (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "belongs in a topic here"),
         (GOOD, "for_each: detections", "collect: {}", "collect: {}", "it is not allowed if the source is a topic"),
         (GOOD, "source: [basestation, sensor_board]\n      ", "", "- collect", 'Missing property "source"'),
         (GATEWAYS, "tcp: 0.0.0.0:8600", "tpc: 0.0.0.0:8600", "tpc", "must be one of udp, tcp"),

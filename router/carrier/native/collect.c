@@ -330,14 +330,14 @@ void collector_close(struct collector *collector) {
 /* Report that `collect` refuses a datagram. Returns false. */
 static bool refuse(struct thread_env *env, const struct targets *to, const struct message *message, int reason,
                    const char *detail) {
-    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
+    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_COLLECT};
     lose_for_all(env, to, message->now, lost, detail);
     return false;
 }
 
 /* Report that the machine refuses it. Returns false. */
 static bool refuse_value(struct thread_env *env, const struct targets *to, const struct message *message, int reason) {
-    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_ROUTE};
+    struct lost_event lost = {.reason = (uint32_t)reason, .generation = to->generation, .place = PLACE_COLLECT};
     for (uint32_t index = 0; index < to->count; index++)
         lose_refused(env, to, &to->targets[index], message->now, lost);
     return false;

@@ -224,6 +224,12 @@ bool deliver_now(struct thread_env *env, const struct targets *to, const struct 
     return leave(env, to, target, data, size, expires, now);
 }
 
+bool deliver_begin(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
+    struct delivery of = {.env = env, .to = to, .target = target, .message = message};
+    of.expires = expiry(&of);
+    return is_wanted(&of) && is_readable(&of) && is_fresh(&of);
+}
+
 bool deliver(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
     struct delivery of = {.env = env, .to = to, .target = target, .message = message};
     bool is_forwarded = !target->message.count, has_condition = target->condition.count;

@@ -74,9 +74,11 @@ struct target {
     uint32_t trims; /* whether it gets datagrams without their trailing zeros */
     uint32_t priority; /* of its messages under a bandwidth: enum priority in pace.h */
     uint32_t id;    /* in events */
-    /* Counters. `waiting` is for a target whose messages pass a ring, `collected` for one that gets frames,
-     * `delivered_bytes` for a destination. */
-    uint32_t waiting, filtered, collected, delivered, delivered_bytes, dropped[DROP_REASONS];
+    /* A topic gets each element of a list in place of the datagram (each.h); NULL without `for_each`. */
+    const struct for_each *for_each;
+    /* Counters. `waiting` is for a target whose messages pass a ring, `collected` for one that gets frames, `split` for one
+     * with `for_each`, `delivered_bytes` for a destination. */
+    uint32_t waiting, filtered, collected, split, delivered, delivered_bytes, dropped[DROP_REASONS];
     struct routine gate; /* the part of the condition that only reads states; empty if messages are never held */
 };
 
@@ -196,6 +198,9 @@ static inline bool may_leave(struct thread_env *env, const struct targets *to, c
 /* Send these bytes, or publish the machine's output, and count that. Return false if the thread was abandoned. */
 bool deliver_now(struct thread_env *env, const struct targets *to, const struct target *target, const uint8_t *data,
                  size_t size, int64_t expires, int64_t now);
+
+/* The first steps for a message that is split for a target: whether it is wanted, readable and fresh. Otherwise it is counted. */
+bool deliver_begin(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message);
 
 /* Deliver a message to one of the targets. Return false if the thread was abandoned. */
 bool deliver(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message);

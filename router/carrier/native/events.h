@@ -110,7 +110,8 @@ struct lost_event {
 enum place {
     PLACE_MESSAGE,
     PLACE_CONDITION,
-    PLACE_ROUTE,     /* `for_each` or `collect` */
+    PLACE_COLLECT,
+    PLACE_FOR_EACH,
     PLACE_OPERATIONS /* plus the index of an operation */
 };
 

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "collect.h"
+#include "each.h"
 #include "evaluate.h"
 #include "events.h"
 
@@ -281,8 +282,11 @@ bool route_to_topics(struct thread_env *env, const struct message_record *record
                               .since = REFUSED_ARRIVAL};
     bool is_delivered = !to->collect || collect(env, to, &message);
     for (uint32_t index = 0; index < to->count; index++) {
-        if (is_delivered && !deliver(env, to, &to->targets[index], &message)) return false;
-        env_count(env, to->targets[index].waiting, -1);
+        const struct target *target = &to->targets[index];
+        bool goes_on = !is_delivered || (target->for_each ? deliver_each(env, to, target, &message)
+                                                          : deliver(env, to, target, &message));
+        if (!goes_on) return false;
+        env_count(env, target->waiting, -1);
     }
     return true;
 }

@@ -2,10 +2,8 @@
 
 #include <string.h>
 
+#include "each.h"
 #include "evaluate.h"
-#include "lists.h"
-
-enum { MOST_ELEMENTS = 1 << 16 /* of one message for `for_each`, as the lock is held meanwhile */ };
 
 /* ---- the age of a message ---- */
 
@@ -45,39 +43,23 @@ static void date_by_stamp(struct ros_routing *routing, const struct ros_route *r
 
 /* ---- messages ---- */
 
-/* Remove an element from a list, and deliver it. Its cells are freed afterwards. */
-static void serve_element(struct ros_routing *routing, const struct ros_route *route, struct message message,
-                          struct value *list, int64_t index) {
-    struct machine *machine = &routing->env.machine;
-    const struct for_each *each = &route->for_each;
-    uint32_t cell_count = machine->cell_count;
-    struct value item = list_next(machine, list, each->stored);
-    if (each->index != NONE) machine->slots[each->index].integer = index;
-    if (each->section == NONE) machine->slots[each->item] = item;
-    else if (!machine_enter(machine, each->section, &item)) message.outcome = DROP_MAPPING_ERROR;
-    deliver_to_all(&routing->env, &route->targets, &message);
-    machine->cell_count = cell_count;
-}
-
 /* Deliver each element of the list of `for_each`. Return their number. A list that is refused or too long counts as one
  * message. */
 static int64_t serve_each(struct ros_routing *routing, const struct ros_route *route, struct message *message) {
     struct machine *machine = &routing->env.machine;
     struct value list;
-    uint32_t at;
-    message->place = PLACE_ROUTE;
-    message->outcome = evaluate_list(machine, &route->for_each.list, &list, &at);
-    if (message->outcome == EVALUATED && list.size > MOST_ELEMENTS) {
-        machine_refuse(machine, (struct refusal){.kind = REFUSED_MOST, .values = {list.size, MOST_ELEMENTS}});
-        message->outcome = DROP_MAPPING_ERROR;
-    }
-    if (message->outcome != EVALUATED) {
+    if (!each_begin(machine, &route->for_each, message, &list)) {
         deliver_to_all(&routing->env, &route->targets, message);
         return 1;
     }
     int64_t count = list.size;
-    if (route->for_each.count != NONE) machine->slots[route->for_each.count].integer = count;
-    for (int64_t index = 0; index < count; index++) serve_element(routing, route, *message, &list, index);
+    for (int64_t index = 0; index < count; index++) {
+        uint32_t cell_count = machine->cell_count;
+        struct message element = *message;
+        each_next(machine, &route->for_each, &element, &list, index);
+        deliver_to_all(&routing->env, &route->targets, &element);
+        machine->cell_count = cell_count;
+    }
     return count;
 }
 

@@ -8,21 +8,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "deliver.h"
+#include "each.h"
 #include "freshness.h"
 #include "rcl_types.h"
 
 /* ---- settings of the table ---- */
-
-/* `for_each`: each element of a list is handled like a message. */
-struct for_each {
-    struct routine list;   /* leaves the list on the stack; empty without `for_each` */
-    uint16_t stored;    /* how the list is stored: enum scalar */
-    uint16_t section;      /* for an element that is a message, or NONE */
-    uint16_t item;      /* slot for any other element */
-    uint16_t index, count; /* slots, or NONE if unused */
-    uint16_t reserved[3];
-};
 
 /* A route, for messages from one of its topics. */
 struct ros_route {

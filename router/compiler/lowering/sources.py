@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from google.protobuf.descriptor import Descriptor
@@ -97,6 +97,33 @@ class _Source:
         """Lower what a message that was held must still meet when it leaves. Raises TooLargeError."""
         return self.condition(self.lowering(), gate_of(conditions))[0] if target.is_deferred else ()
 
+    def for_each(self, node: tree.Node) -> _Elements:
+        """Lower the list of `for_each`, and return it with `item`, `index` and `count`. Raises TooLargeError."""
+        lowering = self.lowering()
+        of = lists.checked_list(lowering, node)
+        _require_small([(operation, node.span) for operation in of.routine])
+        item: Meaning = Slot(0, tree.ITEM)
+        counts = Slot(0, tree.INDEX), Slot(0, tree.COUNT)
+        if of.message is not None:
+            item = lowering.names.element(of.message)
+            item.path = f"{tree.ITEM}."
+        self.temporaries += [slot for slot in (item, *counts) if isinstance(slot, Slot)]
+        return _Elements(of, dict(zip((tree.ITEM, tree.INDEX, tree.COUNT), (item, *counts), strict=True)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Elements:
+    """`for_each`: its list, and the variables for each element."""
+
+    of: lists.StoredList
+    variables: Mapping[str, Meaning]
+
+    def lowered(self, targets: Iterable[Target]) -> LoweredElements:
+        """Return `for_each` once the layout is made; `targets` use the variables."""
+        item = self.variables[tree.ITEM]
+        section = item.index if isinstance(item, Section) and item.wanted else NONE
+        return LoweredElements(self.of.routine, self.of.scalar, section, *_used(self.variables.values(), targets))
+
 
 class Datagram(_Source):
     """A payload from UDP, in its envelope unless it is read alone."""
@@ -113,26 +140,41 @@ class Datagram(_Source):
     def lowered(self, checked: CheckedRoute, targets: Sequence[Target]) -> LoweredRoute:
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
         collect = checked.collect if targets[0].topic else None
+        span = checked.route.span
         if collect is None:
-            by_label = {target.label: self._target(target, "") for target in targets}
-            return LoweredRoute(by_label, self.layout(checked.route.span))
+            by_label, layout = self._targets(targets, "", span)
+            return LoweredRoute(by_label, layout)
         by, count, order = map(self._number, (collect.by, collect.count, collect.order))
         frame = Slot(None, tree.ITEMS), Slot(0, tree.COUNT)
         self.add(*frame)
-        by_label = {target.label: self._target(target, f"{collect.span}: collect") for target in targets}
-        layout = self.layout(checked.route.span)
+        by_label, layout = self._targets(targets, f"{collect.span}: collect", span)
         is_text = isinstance(collect.by.kind, StringKind)
         signed = signs(UINT32, collect.count.kind, collect.order.kind)
         lowered = LoweredCollect(by, count, order, is_text, signed, *_used(frame, by_label.values()))
         return LoweredRoute(by_label, layout, lowered)
 
-    def _target(self, target: Target, place: str) -> Target:
+    def _targets(self, targets: Sequence[Target], collect: str, span: SourceSpan) -> tuple[dict[str, Target], Layout]:
+        """Lower targets, and return them with their layout. `collect` is its place in the table, if there is one."""
+        split = {target.label: self.for_each(target.for_each) for target in targets if target.for_each is not None}
+        made = [self._target(target, split.get(target.label), collect) for target in targets]
+        layout = self.layout(span)
+        for index, target in enumerate(made):
+            if (elements := split.get(target.label)) is not None:
+                made[index] = replace(target, elements=elements.lowered([target]))
+        return {target.label: target for target in made}, layout
+
+    def _target(self, target: Target, elements: _Elements | None, collect: str) -> Target:
         """Lower a topic, or a destination, which gets the datagram as received."""
         lowering = self.lowering()
+        splits = ""
+        if target.for_each is not None and elements is not None:
+            lowering.names.variables |= elements.variables
+            splits = f"{target.for_each.span}: for_each"
         condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
         message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
         gate = self.gate(target, [target.when])
-        return replace(target, condition=condition, gate=gate, message=message, places=("", when, place, *places))
+        places = ("", when, collect, splits, *places)
+        return replace(target, condition=condition, gate=gate, message=message, places=places)
 
     def state(self, state: CheckedState) -> LoweredState:
         """Lower the value of a state. Raises TooLargeError."""
@@ -167,7 +209,8 @@ class RosMessage(_Source):
 
     def lowered(self, checked: CheckedRoute, feed: CheckedSubscription) -> LoweredFeed:
         """Lower a route's routines for these messages. Raises TooLargeError."""
-        elements = self._for_each(feed.for_each) if feed.for_each is not None else None
+        elements = self.for_each(feed.for_each) if feed.for_each is not None else None
+        self.variables |= elements.variables if elements else {}
         stamp = self._stamp(feed.stamp) if feed.stamp is not None else None
         place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""
         targets = {}
@@ -177,7 +220,7 @@ class RosMessage(_Source):
             assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
             beside = target.beside.data if target.beside else b""
             message, places = self.sent(lowering, target.plan, checked.case, beside)
-            all_places = f"{feed.topic.span}: a malformed message", when, place, *places
+            all_places = f"{feed.topic.span}: a malformed message", when, "", place, *places
             gate = self.gate(target, [feed.when, target.when])
             targets[target.label] = replace(target, condition=condition, gate=gate, message=message, places=all_places)
         layout = self.layout(feed.topic.span)
@@ -187,7 +230,7 @@ class RosMessage(_Source):
             targets,
             layout,
             (stamp[0].index, stamp[1].index) if stamp else None,
-            self._elements(elements, targets.values()) if elements else None,
+            elements.lowered(targets.values()) if elements else None,
         )
 
     def sent(
@@ -202,25 +245,6 @@ class RosMessage(_Source):
         _, moment = self.lowering().message(node)
         seconds, nanoseconds = moment.type.fields
         return moment.value(seconds), moment.value(nanoseconds)
-
-    def _for_each(self, node: tree.Node) -> lists.StoredList:
-        """Lower the list of `for_each`, and make `item`, `index` and `count` available to expressions."""
-        lowering = self.lowering()
-        of = lists.checked_list(lowering, node)
-        _require_small([(operation, node.span) for operation in of.routine])
-        if of.message is None:
-            self.add(Slot(0, tree.ITEM))
-        else:
-            item = lowering.names.element(of.message)
-            item.path = f"{tree.ITEM}."
-            self.variables[tree.ITEM] = item
-        self.add(Slot(0, tree.INDEX), Slot(0, tree.COUNT))
-        return of
-
-    def _elements(self, of: lists.StoredList, targets: Iterable[Target]) -> LoweredElements:
-        item, *counts = (self.variables[name] for name in (tree.ITEM, tree.INDEX, tree.COUNT))
-        section = item.index if isinstance(item, Section) and item.wanted else NONE
-        return LoweredElements(of.routine, of.scalar, section, *_used((item, *counts), targets))
 
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all routines made so far. Raises TooLargeError."""
@@ -258,10 +282,14 @@ def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
 
 def _used(variables: Iterable[Meaning], targets: Iterable[Target]) -> Iterator[int]:
     """Yield the slot of each variable that operations of the targets use, NONE for all others."""
-    slots = [operation.slot for target in targets for operation in (*target.condition, *target.message)]
+    slots = [operation.slot for target in targets for operation in _operations(target)]
     for variable in variables:
         is_used = isinstance(variable, Slot) and any(variable is slot for slot in slots)
         yield variable.index if is_used else NONE
+
+
+def _operations(target: Target) -> Routine:
+    return (*target.condition, *target.message, *(target.elements.routine if target.elements else ()))
 
 
 def _with_places(placed: Sequence[Placed]) -> tuple[Routine, tuple[str, ...]]:

@@ -126,7 +126,7 @@ ROUTE: Sequence[Schema] = [
         ]},
         "else": {"allOf": [
             without("fields", "belongs in a topic here; a route has it only if its source is a topic"),
-            without("for_each", "splits a ROS message; it is allowed only if the source is a topic"),
+            without("for_each", "belongs in a topic here; a route has it only if its source is a topic"),
         ]},
     },
 ]  # fmt: skip

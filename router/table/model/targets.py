@@ -132,6 +132,13 @@ class Topic(TargetKeys):
     Example: 10
     """
     qos: Qos | None = None
+    for_each: Annotated[Expression | None, Shape("list_expression"), Words("one message for each of {}")] = None
+    """An expression over the payload that gives a list: one message is published for each element. 'when' and 'fields'
+    see 'item', 'index' and 'count' beside the fields of the payload, and 'auto' copies from 'item'. Only for topics
+    that a route publishes.
+
+    Example: robots_blue
+    """
     fields: FieldMap | None = None
 
     @property
