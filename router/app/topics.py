@@ -157,6 +157,9 @@ def _topic_spans(program: CompiledTable) -> Mapping[str, SourceSpan]:
     """Return the position in the table of each topic, by ROS name."""
     table = program.table
     spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.all_topics}
+    for state in table.states.values():
+        if state.topic is not None:
+            spans[state.topic.topic.value] = state.topic.topic.span
     for gateway in table.gateways.values():
         for inbound in gateway.inbound:
             spans[resolved(inbound.topic.topic.value, table.node)] = inbound.topic.topic.span
@@ -191,6 +194,10 @@ def _users_of_topics(program: CompiledTable) -> Mapping[str, Sequence[str]]:
     for route in program.table.routes:
         for topic in route.all_topics:
             names.setdefault(topic.topic.value, []).append(route.name)
+    for state in program.states:
+        if state.label in state.setters:
+            [topic_name] = state.setters[state.label]
+            names.setdefault(topic_name, []).append(state.label)
     for gateway in program.gateways:
         for name in gateway.inbound:
             names.setdefault(name, []).append(gateway.settings.name)

@@ -40,7 +40,7 @@ _LIVE = 2.0
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "explain", _DESCRIPTION, *_EXAMPLES)
-    everything = "payload cases and gateways (default: all in the table)"
+    everything = "payload cases, states as state.NAME, and gateways (default: all in the table)"
     completes(parser.add_argument("names", nargs="*", metavar="NAME", help=everything), routed)
     add_table(parser)
     parser.add_argument(
@@ -68,6 +68,7 @@ def _explain(args: argparse.Namespace) -> int:
     from router.tools.explain import (
         explained_gateway,
         explained_route,
+        explained_state,
         ignored_gateway,
         known_topics,
         live_route,
@@ -83,23 +84,25 @@ def _explain(args: argparse.Namespace) -> int:
         routes.setdefault(route.case.name, []).append(route)
     gateways = {gateway.settings.name: gateway for gateway in checked.gateways}
     ignored = program.table.ignored_gateways
-    known = [*routes, *gateways, *ignored]
+    states = {state.label: state for state in checked.states.values()}
+    known = [*states, *routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
-            raise UsageError(f"{path} has no route or gateway '{name}'", did_you_mean(name, known))
+            raise UsageError(f"{path} has no route, state or gateway '{name}'", did_you_mean(name, known))
     if args.given is not None and (len(args.names) != 1 or args.names[0] not in routes):
         raise UsageError("--given takes the fields of one payload case", "name it: router explain CASE --given x=1")
     topics, mistyped = seen_topics(program, args.seconds or _LIVE) if args.live else (known_topics(program.table), ())
+    others = {name: explained_state(state, checked) for name, state in states.items()}
+    others |= {name: explained_gateway(gateway, topics) for name, gateway in gateways.items()}
+    others |= {name: ignored_gateway(gateway) for name, gateway in ignored.items()}
     for name in args.names or known:
         for route in routes.get(name, ()):
             code = listed_route(route, program) if args.code else ()
             given = () if args.given is None else tried_route(route, checked, program, args.given)
             now = live_route(route.route, mistyped)
             _print(*explained_route(route, checked), *now, *code, *given, "")
-        if name in gateways:
-            _print(*explained_gateway(gateways[name], topics), "")
-        if name in ignored:
-            _print(*ignored_gateway(ignored[name]), "")
+        if name in others:
+            _print(*others[name], "")
     if not args.names:
         _print(*_kept(path))
     return OK

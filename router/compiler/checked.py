@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from router.compiler.compiled_table import Beside, DeadmanPlan, ObeyedPlan
+from router.compiler.compiled_table import Beside, DeadmanPlan, ObeyedPlan, state_label
 from router.compiler.expressions.kinds import Kind
 from router.compiler.expressions.tree import Node
 from router.compiler.mapping import Row
@@ -92,20 +92,6 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedState:
-    """A state, with the value that a message of `case` gives it. Values are integers, also of bools and enums."""
-
-    declared: State
-    case: PayloadCase
-    value: Node
-    initial: int
-
-    @property
-    def kind(self) -> Kind:
-        return self.value.kind
-
-
-@dataclass(frozen=True, slots=True)
 class CheckedSubscription:
     """A topic that an outbound route subscribes to, with a target for each destination.
 
@@ -120,6 +106,28 @@ class CheckedSubscription:
     for_each: Node | None
     stamp: Node | None
     targets: tuple[Target, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedState:
+    """A state, with the value that a message of `case` or `feed` gives it.
+
+    Values are integers, also of bools and enums. `feed` is the topic of a state that has one, without targets.
+    """
+
+    declared: State
+    value: Node
+    initial: int
+    case: PayloadCase | None = None
+    feed: CheckedSubscription | None = None
+
+    @property
+    def kind(self) -> Kind:
+        return self.value.kind
+
+    @property
+    def label(self) -> str:
+        return state_label(self.declared.name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,12 @@ STRANGER = None
 """The source of a datagram whose sender is not an endpoint of the table."""
 
 
+def state_label(name: str) -> str:
+    """Return the name of a state in expressions and the log, as the target of messages without a value, and as the
+    route of messages of its topic."""
+    return f"{STATE}.{name}"
+
+
 def source_label(source: str | None) -> str:
     """Return the `source` label of a sender: its name, or `unknown` for a stranger on a route from `any`."""
     return source if source is not None else "unknown"
@@ -150,8 +156,8 @@ class DeadmanPlan:
 class StatePlan:
     """A state: an integer, also for a bool or an enum. `valid_for` is in ns, None for never.
 
-    `setters` are the routes whose messages set it, each with the senders that do; `readers` are those with conditions
-    that read it. `place` computes the value.
+    `setters` are the routes whose messages set it, each with the senders that do, or its label with its topic.
+    `readers` are the routes with conditions that read it. `place` computes the value.
     """
 
     name: str
@@ -164,8 +170,7 @@ class StatePlan:
 
     @property
     def label(self) -> str:
-        """The name in expressions, in the log, and as the target of messages without a value."""
-        return f"{STATE}.{self.name}"
+        return state_label(self.name)
 
     @property
     def type(self) -> str:
@@ -217,14 +222,14 @@ class GatewayPlan:
 
 @dataclass(frozen=True, slots=True)
 class RoutePlan:
-    """A route from UDP, or a route from ROS for one of its topics.
+    """A route from UDP, or a route from ROS for one of its topics; or a topic that sets a state, without a case.
 
     `sources` are the endpoints that may send the message, possibly with STRANGER; a route from ROS has none. `ttl` and
     `collect_timeout` are in ns, or None.
     """
 
     route: str
-    case: PayloadCase
+    case: PayloadCase | None
     targets: tuple[Target, ...]
     sources: frozenset[str | None]
     topic: str | None = None

@@ -40,6 +40,11 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         for feed in route.subscriptions:
             topic = feed.topic.topic.value
             outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, lowered, frozenset(), feed))
+    for state in checked.states.values():
+        if state.feed is not None:
+            topic = state.feed.topic.topic.value
+            plan = RoutePlan(state.label, None, (), frozenset(), topic)
+            outbound[topic] = (*outbound.get(topic, ()), plan)
     deadmen = tuple(route.deadman for route in served if route.deadman)
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
@@ -49,7 +54,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
         publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
-        subscriptions=_topics((feed.topic, feed.type) for route in served for feed in route.subscriptions),
+        subscriptions=_topics((feed.topic, feed.type) for feed in [*_feeds(served), *_feeds_of_states(checked)]),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
@@ -71,8 +76,12 @@ def _state(
     served: Iterable[CheckedRoute],
 ) -> StatePlan:
     declared = state.declared
-    names = {source.value for source in declared.sources}
-    taken = {plan.route: names & plan.sources for plan in inbound.get(state.case.number, ())}
+    if state.feed is not None:
+        taken = {state.label: {state.feed.topic.topic.value}}
+    else:
+        names = {source.value for source in declared.sources}
+        plans = inbound.get(state.case.number, ()) if state.case is not None else ()
+        taken = {plan.route: names & plan.sources for plan in plans}
     return StatePlan(
         declared.name,
         state.kind,
@@ -82,6 +91,15 @@ def _state(
         [each.route.name for each in served if declared.name in states_read(each)],
         lowered.states[declared.name].place,
     )
+
+
+def _feeds(routes: Iterable[CheckedRoute]) -> Iterator[CheckedSubscription]:
+    for checked in routes:
+        yield from checked.subscriptions
+
+
+def _feeds_of_states(checked: Checked) -> Iterator[CheckedSubscription]:
+    yield from (state.feed for state in checked.states.values() if state.feed is not None)
 
 
 def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:

@@ -10,14 +10,13 @@ from router.compiler.deadmen import check_deadman
 from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.expressions.lists import as_value
-from router.compiler.expressions.scope import field_of
 from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable
 from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.obeyed import check_obeyed
 from router.compiler.states import sets_state
-from router.compiler.topics import qos_findings, resolved, topic_name_finding
+from router.compiler.topics import qos_findings, resolved, stamp_of, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
 from router.table.model import RouteTable
@@ -235,7 +234,6 @@ def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) 
 
 
 Destinations = Sequence[tuple[Destination, "Endpoint | None"]]
-HEADER = "std_msgs/msg/Header"
 
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
@@ -257,7 +255,7 @@ def _subscription(
 ) -> CheckedSubscription | None:
     """Check a topic and its targets. Return None if the type of `item` is unknown: every use would be reported."""
     scope = lookup.scope(ros_type, ros_type)
-    stamp = _stamp(scope, topic.span) if route.ttl else None
+    stamp = stamp_of(scope, topic.span) if route.ttl else None
     for_each = None
     if route.for_each is not None:
         for_each = _elements(lookup, route.for_each, scope)
@@ -286,15 +284,6 @@ def _element_type(elements: Node) -> MessageType | None:
     """Return the message type of the elements of `for_each`, None if they are not messages."""
     element = elements.kind.element if isinstance(elements.kind, ListKind) else None
     return element.type if isinstance(element, MessageKind) else None
-
-
-def _stamp(scope: Scope, span: SourceSpan) -> Node | None:
-    """Return the field `header.stamp`, or None."""
-    header = scope.message.field("header")
-    if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
-        return None
-    stamp = header.type.field("stamp")
-    return field_of(field_of(scope.whole_message(span), header, span), stamp, span) if stamp else None
 
 
 def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Node | None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from router.compiler.checked import CheckedRoute, CheckedState, Target
+from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
+from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import BoolKind, EnumKind, IntKind, Kind
 from router.compiler.expressions.states import operands_of, reads_message, states_in
 from router.compiler.expressions.tree import Call, Node, constant_of
 from router.compiler.lookup import Lookup
+from router.compiler.topics import qos_findings, resolved, stamp_of, topic_name_finding
 from router.errors import Code, Diagnostic
 from router.table.model.routes import ANY, Route
 from router.table.model.state import State
-from router.table.model.targets import OnLimit
+from router.table.model.targets import OnLimit, Topic
 from router.types.model import MessageType
 
 _KINDS = (BoolKind, EnumKind, IntKind)
@@ -38,30 +40,51 @@ def sets_state(states: Iterable[State], route: Route) -> Iterator[State]:
     sources = {source.value for source in route.sources}
     for state in states:
         is_taken = any({source.value, ANY} & sources for source in state.sources)
-        if is_taken and state.case.value == route.case.value:
+        if is_taken and state.case is not None and state.case.value == route.case.value:
             yield state
 
 
 def _checked(lookup: Lookup, declared: State) -> CheckedState | None:
+    return _of_topic(lookup, declared, declared.topic) if declared.topic else _of_case(lookup, declared)
+
+
+def _of_topic(lookup: Lookup, declared: State, topic: Topic) -> CheckedState | None:
+    findings = (topic_name_finding(topic), *qos_findings(topic, publishes=False))
+    lookup.findings += [finding for finding in findings if finding]
+    ros_type = lookup.ros_type(topic)
+    if ros_type is None:
+        return None
+    scope = lookup.scope(ros_type, ros_type)
+    feed = CheckedSubscription(topic, ros_type, None, None, stamp_of(scope, topic.span), ())
+    valued = _valued(lookup, declared, scope)
+    return CheckedState(declared, *valued, feed=feed) if valued else None
+
+
+def _of_case(lookup: Lookup, declared: State) -> CheckedState | None:
+    assert declared.case is not None  # noqa: S101 - required without a topic
     case = lookup.case(declared.case)
     known = [lookup.endpoint(source) for source in declared.sources]
     if case is None:
         return None
     if all(known):
-        _require_route(lookup, declared)
-    wanted = "a state takes an integer, a bool or an enum"
-    value = lookup.value(declared.value, lookup.received(case), _KINDS, wanted)
-    initial = _initial(lookup, declared, value.kind) if value is not None else None
+        _require_route(lookup, declared, case.name)
+    valued = _valued(lookup, declared, lookup.received(case))
+    return CheckedState(declared, *valued, case=case) if valued else None
+
+
+def _valued(lookup: Lookup, declared: State, scope: Scope) -> tuple[Node, int] | None:
+    """Return what computes the value from a message, and the initial value; None with a finding."""
+    value = lookup.value(declared.value, scope, _KINDS, "a state takes an integer, a bool or an enum")
+    initial = _initial(lookup, declared, value.kind, scope) if value is not None else None
     if value is None or initial is None:
         return None
     if isinstance(value.kind, EnumKind):  # conditions would read a number that the enum lacks as "not MANUAL"
         value = Call(value.kind, value.span, "member", (value,))
-    return CheckedState(declared, case, value, initial)
+    return value, initial
 
 
-def _require_route(lookup: Lookup, declared: State) -> None:
+def _require_route(lookup: Lookup, declared: State, case: str) -> None:
     """Report the first source from which no route takes the messages of a state."""
-    case = declared.case.value
     if f"routes/{case}" in lookup.table.broken:
         return
     routes = [route for route in lookup.table.routes if route.ignore is None and not route.is_outbound]
@@ -76,9 +99,9 @@ def _require_route(lookup: Lookup, declared: State) -> None:
             return
 
 
-def _initial(lookup: Lookup, declared: State, kind: Kind) -> int | None:
-    """Return the initial value, None with a finding."""
-    scope = replace(lookup.scope(_NOTHING), given=())
+def _initial(lookup: Lookup, declared: State, kind: Kind, scope: Scope) -> int | None:
+    """Return the initial value, None with a finding. `scope` is that of the value, whose constants are visible."""
+    scope = replace(scope, message=_NOTHING, given=(), envelope=None)
     enum = kind.enum if isinstance(kind, EnumKind) else None
     wanted = f"'initial' takes a value of 'state.{declared.name}', which is {kind}"
     node = lookup.value(declared.initial, scope, (type(kind),), wanted, expected=enum)
@@ -106,6 +129,12 @@ def condition_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
     commanded: dict[str, str] = {}
     for checked in routes:
         own = {state.name for state in sets_state(states.values(), checked.route)}
+        topics = {resolved(feed.topic.topic.value, lookup.table.node) for feed in checked.subscriptions}
+        own |= {
+            state.name
+            for state in states.values()
+            if state.topic is not None and resolved(state.topic.topic.value, lookup.table.node) in topics
+        }
         for target, conditions in _with_conditions(checked):
             read = states_in(conditions)
             if target.is_command:

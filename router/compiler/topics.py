@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from router.compiler.compiled_table import QosPlan
+from router.compiler.expressions import Scope
+from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.tree import Node
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.keys import keys_of
 from router.table.model import RouteTable
@@ -16,10 +19,12 @@ from router.table.model.gateways import InboundDeadman
 from router.table.model.routes import Route
 from router.table.model.settings import NodeSettings
 from router.table.model.targets import OnLimit, Qos, Topic
+from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 DEFAULT_DEPTH = 10
 LONGEST_NAME = 247
+HEADER = "std_msgs/msg/Header"
 DIAGNOSTICS, DIAGNOSTICS_TYPE = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 _NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
@@ -87,6 +92,15 @@ def topic_name_finding(topic: Topic) -> Diagnostic | None:
     return None
 
 
+def stamp_of(scope: Scope, span: SourceSpan) -> Node | None:
+    """Return the field `header.stamp`, or None."""
+    header = scope.message.field("header")
+    if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
+        return None
+    stamp = header.type.field("stamp")
+    return field_of(field_of(scope.whole_message(span), header, span), stamp, span) if stamp else None
+
+
 def resolved(name: str, node: NodeSettings) -> str:
     """Return the absolute ROS name of a topic of this node."""
     namespace = node.namespace.rstrip("/")
@@ -145,10 +159,11 @@ class _Use:
 
 
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
-    """Check topics that several routes or gateways name.
+    """Check topics that several routes, states or gateways name.
 
     A topic must have one type, one QoS per direction, compatible QoS of publisher and subscription, no way back to a
-    sender, and no deadman that competes with other publishers. A gateway counts with the topics of its `inbound`.
+    sender, and no deadman that competes with other publishers. A state counts with its topic, a gateway with those of
+    its `inbound`.
     """
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
@@ -177,6 +192,9 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
     for route in routes:
         for topic in route.all_topics:
             yield _Use(topic, f"route '{route.name}'", topic in route.topics, qos_of(topic), route)
+    for state in table.states.values():
+        if state.topic is not None:
+            yield _Use(state.topic, f"state '{state.name}'", False, qos_of(state.topic))
     for gateway in table.gateways.values():
         for inbound in gateway.inbound:
             owner = f"gateway '{gateway.name}'"

@@ -92,7 +92,7 @@ class Openings:
     def collector(self, plan: RoutePlan) -> int:
         """Open the collector that makes frames of the route's payload for its topics."""
         topics = tuple(_plain(target) for target in plan.targets if target.is_topic)
-        payload = plan.case.name, self.program.protos_sha256
+        payload = plan.case.name if plan.case else "", self.program.protos_sha256
         return self._open(("collector", plan.route), "collector_open", plan.collect_timeout, of=(*payload, *topics))
 
     def state(self, plan: StatePlan) -> int:

@@ -68,34 +68,48 @@ class TargetWriter:
 
     def setters(self, plan: RoutePlan) -> Iterator[c.Setter]:
         """Yield what the messages of a route set: each state, for each sender."""
-        counters, number = self.program.counters, self.openings.names.number
         columns = {name: column for column, name in enumerate(self.program.table.endpoints)}
         for state in self.program.states:
             sources = sorted(state.setters.get(plan.route, ()), key=columns.__getitem__)
             if not sources:
                 continue
-            lowered = self.program.lowered.states[state.name]
-            routines = self.routines(lowered.layout)
-            target = c.Target(message=routines.routine(lowered.routine), id=number(state.label))
-            target.dropped[:] = [
-                counters.index("messages_dropped", plan.route, state.label, reason) for reason in DROP_REASON_NAMES
-            ]
-            layout, targets = routines.layout(), ctypes.pointer(self.arrays.add(target))
+            to = self._of_state(plan, state)
+            to.sources = self.names_of_senders()
             for source in sources:
-                yield c.Setter(
-                    state=self.openings.state(state),
-                    to=c.Targets(
-                        layout=layout,
-                        sources=self.names_of_senders(),
-                        targets=targets,
-                        count=1,
-                        route=number(plan.route),
-                        topic=c.NO_NAME,
-                    ),
-                    column=columns[source],
-                    source=number(source),
-                    age=counters.index("state_set_seconds", state.name, source),
-                )
+                yield self._setter(state, to, source, columns[source])
+
+    def setter_of_topic(self, plan: RoutePlan) -> Any:
+        """Return what messages of a topic set; None if the plan is that of a route."""
+        for state in self.program.states:
+            if plan.route in state.setters and plan.topic is not None:
+                return ctypes.pointer(self.arrays.add(self._setter(state, self._of_state(plan, state), plan.topic)))
+        return None
+
+    def _setter(self, state: StatePlan, to: c.Targets, source: str, column: int = 0) -> c.Setter:
+        return c.Setter(
+            state=self.openings.state(state),
+            to=to,
+            column=column,
+            source=self.openings.names.number(source),
+            age=self.program.counters.index("state_set_seconds", state.name, source),
+        )
+
+    def _of_state(self, plan: RoutePlan, state: StatePlan) -> c.Targets:
+        """Write what reads the messages of a route for a state, with a target that stands for it."""
+        counters, number = self.program.counters, self.openings.names.number
+        lowered = self.program.lowered.states[state.name]
+        routines = self.routines(lowered.layout)
+        target = c.Target(message=routines.routine(lowered.routine), id=number(state.label))
+        target.dropped[:] = [
+            counters.index("messages_dropped", plan.route, state.label, reason) for reason in DROP_REASON_NAMES
+        ]
+        return c.Targets(
+            layout=routines.layout(),
+            targets=ctypes.pointer(self.arrays.add(target)),
+            count=1,
+            route=number(plan.route),
+            topic=c.NO_NAME if plan.topic is None else number(plan.topic),
+        )
 
     def of_datagrams(self, plan: RoutePlan, targets: Sequence[Target], lowered: LoweredRoute | None) -> c.Targets:
         """Write the targets that get datagrams; `lowered` are the routines of targets that have some."""

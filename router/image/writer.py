@@ -226,7 +226,7 @@ class _Writer:
     def _witnesses(self, plan: RoutePlan) -> Iterator[c.Witness]:
         """Yield a witness for each deadman that awaits messages of this route, and each endpoint that sends them."""
         for deadman in self.program.deadmen:
-            if deadman.obeyed is not None and deadman.obeyed.case.name == plan.case.name:
+            if plan.case is not None and deadman.obeyed is not None and deadman.obeyed.case.name == plan.case.name:
                 yield from (self._witness(deadman, name) for name in deadman.obeyed.endpoints if name in plan.sources)
 
     def _witness(self, deadman: DeadmanPlan, endpoint: str) -> c.Witness:
@@ -266,6 +266,7 @@ def _ros_route(writer: TargetWriter, plan: RoutePlan, feed: LoweredFeed) -> c.Ro
     return c.RosRoute(
         targets=targets,
         for_each=for_each,
+        setter=writer.setter_of_topic(plan),
         seconds=seconds,
         nanoseconds=nanoseconds,
         received=counters.index("messages_received", plan.route, plan.topic),

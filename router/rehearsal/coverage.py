@@ -99,6 +99,10 @@ def _items(checked: Checked, program: CompiledTable) -> Iterator[tuple[Key, Item
     for route in routes:
         name = route.route.name
         yield ("route", name), Item("route", route.route.span, f"no test has a message for the route {name}")
+    for state in checked.states.values():
+        if state.feed is not None:
+            gap = f"no test has a message that sets {state.label}"
+            yield ("route", state.label), Item("route", state.declared.span, gap)
     for route in routes:
         yield from _targets(route)
     if any(source.value != ANY for route in routes for source in route.route.sources):

@@ -221,6 +221,7 @@ class Names:
     @cached_property
     def _subscribed(self) -> Mapping[str, MessageType]:
         subscriptions = [subscription for route in self._checked.routes for subscription in route.subscriptions]
+        subscriptions += [state.feed for state in self._checked.states.values() if state.feed is not None]
         return {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
 
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:

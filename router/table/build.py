@@ -123,7 +123,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         foxglove=builder.one(root, "foxglove", _server),
         reload_on_change=builder.one(root, "reload", _reload) or False,
         networks=builder.one(root, "networks", _networks),
-        states=builder.each(root, "state", _named(State)),
+        states=builder.each(root, "state", _state),
     )
 
 
@@ -244,6 +244,12 @@ def _endpoint(entry: Entry) -> Endpoint:
     beside = settings.entries.get("set")
     given = {"name": entry.key.text, "span": entry.key.span}
     return structure(Endpoint, settings, **given, beside=_constants(beside) if beside else None)
+
+
+def _state(entry: Entry) -> State:
+    settings = mapping(entry.value)
+    topic = _topic(settings, settings.entries["topic"].key.span) if settings.get("topic") else None
+    return structure(State, settings, name=entry.key.text, span=entry.key.span, topic=topic)
 
 
 def _envelope(entry: Entry) -> EnvelopeSettings:

@@ -321,6 +321,8 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
         and missing in ("topic", "endpoint")
     ):
         hint = "if its keys belong to the item above, remove the '-'"
+    if error.path[:1] == ("state",) and missing in ("case", "source"):
+        hint = "write 'case' and 'source', or 'topic' and 'type' for what a ROS topic sets"
     if error.path[-1:] == ("deadman",) and missing == "send":
         fields = "FIELD: VALUE"
         stopping = fields if error.path[0] == "gateways" else f"CASE: {{{fields}}}"

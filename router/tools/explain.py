@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from router.compiler import Checked
 from router.compiler.cdr import message_size
-from router.compiler.checked import CheckedRoute, Target
+from router.compiler.checked import CheckedRoute, CheckedState, Target
 from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.selection import TopicSelector
-from router.compiler.states import sets_state
+from router.compiler.states import sets_state, states_read
 from router.compiler.topics import qos_of, resolved
 from router.datagrams import Wire
 from router.errors import ConfigurationError, UsageError, plural, shown_path
@@ -147,10 +147,26 @@ def _set(state: State, route: Route) -> str:
     """Describe what messages of a route do to a state: `state.mode: mode, for 5 s, then MODE_MANUAL`."""
     own = {source.value for source in route.sources}
     senders = [source.value for source in state.sources if {source.value, ANY} & own]
-    valid = state.valid_for.value if state.valid_for else 0
-    ends = f"for {duration(valid)}, then {state.initial.text}" if valid else f"{state.initial.text} before the first"
     by = f" from {', '.join(senders)}" if own != {*senders} else ""
-    return f"state.{state.name}: {state.value.text}{by}, {ends}"
+    return f"state.{state.name}: {state.value.text}{by}, {_validity(state)}"
+
+
+def _validity(state: State) -> str:
+    valid = state.valid_for.value if state.valid_for else 0
+    return f"for {duration(valid)}, then {state.initial.text}" if valid else f"{state.initial.text} before the first"
+
+
+def explained_state(state: CheckedState, everything: Checked) -> Iterator[str]:
+    declared = state.declared
+    yield f"{state.label}: {state.kind}  ({declared.span})"
+    if state.feed is not None:
+        yield f"  from topic {state.feed.topic.topic.value}: {state.feed.type}"
+        yield _quality(state.feed.topic)
+    elif state.case is not None:
+        yield f"  from {state.case.name}, sent by {', '.join(source.value for source in declared.sources)}"
+    yield f"  {declared.value.text}, {_validity(declared)}"
+    readers = [route.route.name for route in everything.routes if declared.name in states_read(route)]
+    yield f"  read by {', '.join(readers) or 'no condition'}"
 
 
 def _source(name: str, table: RouteTable) -> str:
@@ -497,6 +513,8 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
     parts |= {f"endpoint {name}": _settings_lines(endpoint) for name, endpoint in table.endpoints.items()}
     for route in checked.routes:
         parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
+    for state in checked.states.values():
+        parts[state.label] = _comparable(explained_state(state, checked))
     for gateway in checked.gateways:
         parts[f"gateway {gateway.settings.name}"] = [
             *_comparable(explained_gateway(gateway, {})),

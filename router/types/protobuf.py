@@ -403,9 +403,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     options = {field.name: schema.board_options(field) for field in oneof.fields}
     # An unbounded case is only reported if it is sent to a board.
     bounded = [
-        case.max_frame
-        for case in cases.values()
-        if case.max_frame is not None and not options[case.name].is_ignored
+        case.max_frame for case in cases.values() if case.max_frame is not None and not options[case.name].is_ignored
     ]
     sizes = (member_size(field, schema.board_options) for field in others)
     bounded += [size for size in sizes if size is not None]

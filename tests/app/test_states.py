@@ -17,6 +17,7 @@ from tests.ros.peers import Publisher, wait_until
 
 TYPE = "comms/msg/DrivingBoardMotorMessage"
 MANUAL, AUTO = bytes.fromhex("820100"), bytes.fromhex("8201020801")
+TRUE, FALSE = b"\0\1\0\0\1", b"\0\1\0\0\0"
 PASSES = "state.mode == MODE_AUTO"
 
 
@@ -84,3 +85,21 @@ def test_a_change_by_a_datagram_that_waited_for_the_start_is_logged_in_words(sit
         wait_until(lambda: router.total("state_changes") == 1)
     [told] = [log for log in logs if log["event"] == "state changed"]
     assert (told["before"], told["after"]) == ("MODE_MANUAL", "MODE_AUTO")
+
+
+def test_a_topic_lets_commands_from_ros_pass(site: Site, publisher: Publisher) -> None:
+    of_topic = table("state.may_drive").replace(
+        "state:\n", "state:\n  may_drive: {topic: may_drive, type: std_msgs/msg/Bool, value: data, initial: false}\n"
+    )
+    with closing(Publisher("may_drive", "std_msgs/msg/Bool")) as allowing, site.router(of_topic) as router:
+        assert publisher.line() == allowing.line() == "matched"
+        publisher.publish([command(1)])
+        wait_until(lambda: router.total("messages_filtered") == 1)
+        allowing.publish([TRUE])
+        wait_until(lambda: router.total("state_changes") == 1)
+        publisher.publish([command(2)])
+        assert number_of(site.basestation.recv(1000)) == 2
+        allowing.publish([FALSE])
+        wait_until(lambda: router.total("state_changes") == 2)
+        publisher.publish([command(3)])
+        wait_until(lambda: router.total("messages_filtered") == 2)

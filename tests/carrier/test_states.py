@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from tests.carrier.building import RACES, run_program
 from tests.small_tables import BASESTATION, HEAD, MS, SECOND, enveloped, program
 
 ROUTE = "  control_mode: {source: basestation}\n"
+NO_ROUTE = "  control_mode: {ignore: only topics set states here}\n"
 MODE = "mode: {case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}"
 MANUAL, AUTO = 0, 1
 
@@ -21,14 +23,14 @@ MANUAL, AUTO = 0, 1
 class States:
     """A run of a table with one state; `changes` are those since the last call of `run`."""
 
-    def __init__(self, folder: Path, state: str = MODE) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, state: str = MODE, route: str = ROUTE) -> None:
+        self.folder, self.route = folder, route
         self.compiled = self._program(state)
         self.simulation = Simulation(library(), 10**12)
         self.simulation.adopt(self.compiled)
 
     def _program(self, state: str) -> CompiledTable:
-        return program(self.folder, f"{ROUTE}state:\n  {state}\n", HEAD)
+        return program(self.folder, f"{self.route}state:\n  {state}\n", HEAD)
 
     def set(self, mode: int) -> None:
         data = enveloped(control_mode={"mode": mode})
@@ -134,3 +136,25 @@ def test_a_negative_value_is_counted_as_such(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sanitizers", ["", pytest.param(RACES, marks=pytest.mark.slow)])
 def test_readers_get_a_value_with_its_own_time(tmp_path: Path, sanitizers: str) -> None:
     run_program("states", tmp_path, 20_000 if sanitizers else 200_000, sanitizers=sanitizers)
+
+
+def test_messages_of_a_topic_set_a_state(tmp_path: Path) -> None:
+    mode = "mode: {topic: mode/set, type: std_msgs/msg/Int8, value: data, initial: -1, valid_for: 5s}"
+    states = States(tmp_path, mode, NO_ROUTE)
+    states.simulation.message("mode/set", b"\0\1\0\0\3", states.simulation.now)
+    assert states.changes() == [StateChange("mode", -1, 3, "mode/set")]
+    assert states.count("state_set_seconds", "mode/set") == states.simulation.now
+    states.simulation.message("mode/set", b"\0\1\0\0", states.simulation.now)
+    [report] = [each.report for each in states.simulation.records() if isinstance(each, CountedReport)]
+    assert (report.place, report.target, report.reason) == ("state.mode", "state.mode", "mapping_error")
+    assert states.changes(5 * SECOND) == []
+    assert states.changes(1) == [StateChange("mode", 3, -1, None)]
+
+
+def test_a_message_of_a_topic_counts_from_its_stamp(tmp_path: Path) -> None:
+    mode = "mode: {topic: at, type: geometry_msgs/msg/PointStamped, value: trunc(point.x), initial: -1, valid_for: 5s}"
+    states = States(tmp_path, mode, NO_ROUTE)
+    header = struct.pack("<iII4x", states.simulation.now // SECOND - 3, 0, 1)
+    states.simulation.message("at", b"\0\1\0\0" + header + struct.pack("<3d", 8, 0, 0), states.simulation.now)
+    assert states.changes(2 * SECOND) == [StateChange("mode", -1, 8, "at")]
+    assert states.changes(1) == [StateChange("mode", 8, -1, None)]

@@ -60,7 +60,7 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Compile
     for case in (*rover_program.envelope.cases, UNKNOWN_CASE):
         assert Series("unhandled", (case,)) in series
     for [plan] in rover_program.inbound.values():
-        route = plan.case.name
+        route = plan.route
         for target in plan.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             assert Series(delivered, (route, target.label)) in series

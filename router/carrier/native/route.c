@@ -103,28 +103,6 @@ static void hand_over(struct routing *routing, const struct targets *to, const s
         drop_oldest(routing, received->now);
 }
 
-/* ---- states ---- */
-
-/* Set a state to the value of the datagram, unless it has none. */
-static void set_state(struct routing *routing, const struct setter *setter, const struct received *received,
-                      const struct datagram *datagram) {
-    struct machine *machine = &routing->env.machine;
-    const struct target *state = setter->to.targets;
-    struct lost_event lost = {.reason = DROP_MAPPING_ERROR, .generation = setter->to.generation, .place = PLACE_MESSAGE};
-    if (read_datagram(machine, setter->to.layout, setter->to.sources, datagram)) {
-        struct value value;
-        uint32_t at;
-        int outcome = evaluate_value(machine, &state->message, &value, &at);
-        if (outcome == EVALUATED) {
-            state_set(routing->env.timers, setter, value.integer, received->times.oldest);
-            return;
-        }
-        lost.reason = (uint32_t)outcome;
-        lost.place = PLACE_OPERATIONS + at;
-    }
-    lose_refused(&routing->env, &setter->to, state, received->now, lost);
-}
-
 /* ---- witnesses ---- */
 
 static bool meets_condition(struct machine *machine, const struct witness *witness, const struct datagram *datagram) {
@@ -159,9 +137,12 @@ static void show_to_deadmen(struct routing *routing, const struct route *route, 
 /* Set the states that the datagram sets, and show it to deadmen. */
 static void watch(struct routing *routing, const struct route *route, const struct received *received) {
     struct datagram datagram = datagram_of(routing, received);
-    for (uint32_t index = 0; index < route->setter_count; index++)
-        if (route->setters[index].column == received->column)
-            set_state(routing, &route->setters[index], received, &datagram);
+    for (uint32_t index = 0; index < route->setter_count; index++) {
+        const struct setter *setter = &route->setters[index];
+        if (setter->column != received->column) continue;
+        bool is_read = read_datagram(&routing->env.machine, setter->to.layout, setter->to.sources, &datagram);
+        set_state(&routing->env, setter, is_read, received->times.oldest, received->now);
+    }
     show_to_deadmen(routing, route, received, &datagram);
 }
 

@@ -95,12 +95,15 @@ void route_ros(struct ros_routing *routing, const struct ros_route *route, const
                               .since = taken->published_at ? REFUSED_SENDING : REFUSED_ARRIVAL};
     struct machine *machine = &routing->env.machine;
     int64_t count = 1;
-    if (route->targets.ttl) message.times = sent(routing, taken);
+    bool is_dated = route->targets.ttl || route->setter;
+    if (is_dated) message.times = sent(routing, taken);
     machine_begin(machine, route->targets.layout);
     machine->slots[SLOT_RECEIVED_AT].integer = taken->received_at;
     if (!machine_read(machine, taken->data, taken->size)) message.outcome = DROP_MAPPING_ERROR;
-    else if (route->targets.ttl) date_by_stamp(routing, route, taken, &message);
-    if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
+    else if (is_dated) date_by_stamp(routing, route, taken, &message);
+    if (route->setter)
+        set_state(&routing->env, route->setter, message.outcome == EVALUATED, message.times.oldest, taken->now);
+    else if (route->for_each.list.count && message.outcome == EVALUATED) count = serve_each(routing, route, &message);
     else deliver_to_all(&routing->env, &route->targets, &message);
     env_count(&routing->env, route->received, count);
 }

@@ -11,13 +11,15 @@
 #include "each.h"
 #include "freshness.h"
 #include "rcl_types.h"
+#include "state.h"
 
 /* ---- settings of the table ---- */
 
-/* A route, for messages from one of its topics. */
+/* A route, for messages from one of its topics; or a state that they set, which has no targets. */
 struct ros_route {
     struct targets targets;
     struct for_each for_each;
+    const struct setter *setter; /* NULL for a route */
     uint16_t seconds, nanoseconds; /* slots of the message's stamp, or NONE */
     uint32_t received, last_message, duration; /* counters; the second one has the boot clock, the last one is a histogram */
 };

@@ -2,6 +2,7 @@
 
 #include <stdlib.h>
 
+#include "evaluate.h"
 #include "state_value.h"
 
 /* ---- with the lock held ---- */
@@ -76,6 +77,23 @@ void state_set(struct timers *timers, const struct setter *setter, int64_t value
     announce(timers, state, timers->env->now(timers->env), setter->source);
     await_expiry(timers, state);
     pthread_mutex_unlock(&timers->lock);
+}
+
+void set_state(struct thread_env *env, const struct setter *setter, bool is_read, int64_t at, int64_t now) {
+    const struct target *target = setter->to.targets;
+    struct lost_event lost = {.reason = DROP_MAPPING_ERROR, .generation = setter->to.generation, .place = PLACE_MESSAGE};
+    if (is_read) {
+        struct value value;
+        uint32_t operation;
+        int outcome = evaluate_value(&env->machine, &target->message, &value, &operation);
+        if (outcome == EVALUATED) {
+            state_set(env->timers, setter, value.integer, at);
+            return;
+        }
+        lost.reason = (uint32_t)outcome;
+        lost.place = PLACE_OPERATIONS + operation;
+    }
+    lose_refused(env, &setter->to, target, now, lost);
 }
 
 struct state *state_open(void) {

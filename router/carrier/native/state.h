@@ -23,13 +23,13 @@ struct state_settings {
     uint32_t reserved;
 };
 
-/* The messages of a route from one sender that set a state. */
+/* The messages of a route from one sender, or of a topic, that set a state. */
 struct setter {
     struct state *state;
     /* What reads the fields. Its only target stands for the state: `message` computes the value, and losses are counted there. */
     struct targets to;
-    uint32_t column; /* of the sender */
-    uint32_t source; /* its name, in events */
+    uint32_t column; /* of the sender; not for a topic */
+    uint32_t source; /* the name of the sender or topic, in events */
     uint32_t age;    /* counter: boot clock */
     uint32_t reserved;
 };
@@ -41,7 +41,11 @@ void state_close(struct state *state);
 /* Adopt the settings of a program. Takes the lock. */
 void states_adopt(struct timers *timers, const struct state_settings *settings, uint32_t count);
 
-/* Set the state to the value of a message that arrived at `at` (boot clock). Takes the lock. */
+/* Set the state to a value, that of a message of `at` (boot clock). Takes the lock. */
 void state_set(struct timers *timers, const struct setter *setter, int64_t value, int64_t at);
+
+/* Do so with the message that the environment's machine has read; `is_read`: without an error. If it has no value, count and
+ * report that instead. */
+void set_state(struct thread_env *env, const struct setter *setter, bool is_read, int64_t at, int64_t now);
 
 #endif

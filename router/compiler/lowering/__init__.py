@@ -5,7 +5,7 @@ Each target is lowered once. A routine that is too large is a finding.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from router.compiler.checked import CheckedRoute, CheckedState
 from router.compiler.expressions.tree import Node
@@ -73,6 +73,8 @@ def lower_table(
         except TooLargeError as error:
             findings.append(error.diagnostic)
     values = _lower_states(states, envelope, findings)
+    for topic, of_state in _feeds(states, values):
+        from_ros[topic] = (*from_ros.get(topic, ()), of_state)
     return Lowered(to_destinations, to_topics, from_ros, obeyed, values), findings
 
 
@@ -82,10 +84,23 @@ def _lower_states(
     lowered = {}
     for name, state in states.items():
         try:
-            lowered[name] = Datagram(state.case, envelope).state(state)
+            if state.feed is not None:
+                lowered[name] = RosMessage(state.feed.type, state.feed.topic.topic.value).state(state, state.feed)
+            elif state.case is not None:
+                lowered[name] = Datagram(state.case, envelope).state(state)
         except TooLargeError as error:
             findings.append(error.diagnostic)
     return lowered
+
+
+def _feeds(
+    states: Mapping[str, CheckedState], lowered: Mapping[str, LoweredState]
+) -> Iterator[tuple[str, LoweredFeed]]:
+    """Yield the topics that set states, which are urgent."""
+    for name, value in lowered.items():
+        state = states[name]
+        if state.feed is not None:
+            yield state.feed.topic.topic.value, LoweredFeed(state.label, True, {}, value.layout, value.stamp, None)
 
 
 def lower_condition(

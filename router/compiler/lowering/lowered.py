@@ -57,7 +57,8 @@ class LoweredElements:
 class LoweredFeed:
     """A route's routines for the messages of one topic, which are urgent if they expire, or feed or disarm a deadman.
 
-    `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
+    A state that the topic sets has one without targets, with the state's label as the `route`. `stamp` are the slots of
+    seconds and nanoseconds of the message's stamp, or None.
     """
 
     route: str
@@ -78,11 +79,15 @@ class LoweredCondition:
 
 @dataclass(frozen=True, slots=True)
 class LoweredState:
-    """What computes the value of a state from a payload, and the fields that it reads; `place` is its place."""
+    """What computes the value of a state from a message, and the fields that it reads; `place` is its place.
+
+    `stamp` is as in LoweredFeed.
+    """
 
     routine: Routine
     layout: Layout
     place: str
+    stamp: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,6 +93,11 @@ class _Source:
         lowering.names.variables[slot.name] = slot
         return Operation(Op.STATE, slot, number=self.states.index(name))
 
+    def _number(self, node: tree.Node) -> Routine:
+        routine = self.lowering().value(node)
+        _require_small([(operation, node.span) for operation in routine])
+        return routine
+
     def gate(self, target: Target, conditions: Sequence[tree.Node | None]) -> Routine:
         """Lower what a message that was held must still meet when it leaves. Raises TooLargeError."""
         return self.condition(self.lowering(), gate_of(conditions))[0] if target.is_deferred else ()
@@ -182,11 +187,6 @@ class Datagram(_Source):
         _require_fast(routine, span, "the value of a state")
         return LoweredState(routine, self.layout(span), f"{span}: state")
 
-    def _number(self, node: tree.Node) -> Routine:
-        routine = self.lowering().value(node)
-        _require_small([(operation, node.span) for operation in routine])
-        return routine
-
     def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
         """Lower the ROS message of a topic, with the place of each operation."""
         return _with_places(cdr_message(lowering, plan))
@@ -211,7 +211,7 @@ class RosMessage(_Source):
         """Lower a route's routines for these messages. Raises TooLargeError."""
         elements = self.for_each(feed.for_each) if feed.for_each is not None else None
         self.variables |= elements.variables if elements else {}
-        stamp = self._stamp(feed.stamp) if feed.stamp is not None else None
+        stamp = self._stamp(feed.stamp)
         place = f"{feed.for_each.span}: for_each" if feed.for_each is not None else ""
         targets = {}
         for target in feed.targets:
@@ -229,9 +229,14 @@ class RosMessage(_Source):
             is_urgent(checked.route, feed),
             targets,
             layout,
-            (stamp[0].index, stamp[1].index) if stamp else None,
+            _indexes(stamp),
             elements.lowered(targets.values()) if elements else None,
         )
+
+    def state(self, state: CheckedState, feed: CheckedSubscription) -> LoweredState:
+        """Lower the value of a state. Raises TooLargeError."""
+        routine, span, stamp = self._number(state.value), state.value.span, self._stamp(feed.stamp)
+        return LoweredState(routine, self.layout(span), f"{span}: state", _indexes(stamp))
 
     def sent(
         self, lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b""
@@ -239,8 +244,10 @@ class RosMessage(_Source):
         """Lower the envelope for a destination, with the place of each operation. `beside` precedes the payload."""
         return _with_places(protobuf_message(lowering, plan, case, beside))
 
-    def _stamp(self, node: tree.Node) -> tuple[Slot, Slot]:
-        """Return the slots of the seconds and nanoseconds of a field with a time."""
+    def _stamp(self, node: tree.Node | None) -> tuple[Slot, ...]:
+        """Return the slots of the seconds and nanoseconds of a field with a time; none without a field."""
+        if node is None:
+            return ()
         assert isinstance(node, tree.Read)  # noqa: S101 - it is a field of the message
         _, moment = self.lowering().message(node)
         seconds, nanoseconds = moment.type.fields
@@ -278,6 +285,11 @@ class Constants(_Source):
 def is_urgent(route: Route, feed: CheckedSubscription) -> bool:
     """Return whether messages from a topic are served before others: they expire, or feed or disarm a deadman."""
     return route.ttl is not None or any(target.deadmen for target in feed.targets)
+
+
+def _indexes(stamp: tuple[Slot, ...]) -> tuple[int, int] | None:
+    """Return the numbers of the slots of a stamp, known once there is a layout."""
+    return (stamp[0].index, stamp[1].index) if stamp else None
 
 
 def _used(variables: Iterable[Meaning], targets: Iterable[Target]) -> Iterator[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from router.table.grammar.keys import REASON, TEXT, Schema, about, key, mapping, part, properties, ref, required
-from router.table.grammar.rules import GATEWAY, LIMIT, ROUTE, alone, without
+from router.table.grammar.rules import GATEWAY, LIMIT, ROUTE, STATE, alone, without
 from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
@@ -58,6 +58,17 @@ _SOURCE_TOPIC = key(
     "A ROS topic that messages come from: the router subscribes to it.",
     mapping(_some(properties(Topic), *_OF_ALL_TOPICS, "when"), required=["topic"]),
 )
+_STATE = {
+    **about(State),
+    **mapping({
+        **_some(properties(State), "case", "source"),
+        "topic": key("Topic", "The ROS topic whose messages set it: the router subscribes to it.", TEXT, "mode/set"),
+        "type": key("Type", "The ROS message type of the topic.", TEXT, "std_msgs/msg/Bool"),
+        **_some(properties(Topic), "queue_depth", "qos"),
+        **properties(State),
+    }),
+    "allOf": STATE,
+}  # fmt: skip
 _QOS = {
     **about(Qos),
     "type": ["object", "string"],
@@ -169,7 +180,7 @@ _DEFAULTS = key("Defaults", "Values for parts of the table that do not set their
 PARTS: Schema = {
     "listener": part(Listener),
     "endpoint": part(Endpoint),
-    "state": part(State),
+    "state": _STATE,
     "case": _CASE,
     "route": _ROUTE,
     "deadman": {

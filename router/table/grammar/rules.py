@@ -66,7 +66,14 @@ COMPLETE: Schema = {
             "foxglove": {"required": ["address"]},
             "listen": _each({"required": required(Listener)}),
             "endpoints": _each({"required": required(Endpoint)}),
-            "state": _each({"required": required(State)}),
+            "state": _each(
+                {
+                    "required": required(State),
+                    "if": {"required": ["topic"]},
+                    "then": {"required": ["type"]},
+                    "else": {"required": ["case", "source"]},
+                }
+            ),
             "routes": _each(ref("complete_route")),
             "gateways": _each(ref("complete_gateway")),
         },
@@ -130,6 +137,14 @@ ROUTE: Sequence[Schema] = [
         ]},
     },
 ]  # fmt: skip
+
+STATE: Sequence[Schema] = [
+    {
+        "if": {"required": ["topic"]},
+        "then": without("case|source", "is for a state that datagrams set; it is not allowed with 'topic'"),
+        "else": without("type|queue_depth|qos", "is for a state that a topic sets; it needs 'topic', which is missing"),
+    },
+]
 
 # -- of gateways
 

@@ -6,31 +6,23 @@ from typing import Annotated
 from router.errors import Located, SourceSpan
 from router.table.keys import Listed, Named, Shape
 from router.table.model.expressions import Expression
+from router.table.model.targets import Topic
 from router.table.units import VALIDITY
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """A value that messages of a payload case set, and that conditions read as 'state.NAME'.
+    """A value that messages of a payload case, or of a ROS topic, set, and that conditions read as 'state.NAME'.
 
-    `span` is its name in the table. `valid_for` is in ns, 0 for never, None if it is not set.
+    `span` is its name in the table. It has either `case` and `sources` or a `topic`. `valid_for` is in ns, 0 for never,
+    None if it is not set.
 
     Example: {case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}
+    Example: {topic: emergency_stop, type: std_msgs/msg/Bool, value: data, initial: true, valid_for: 1s}
     """
 
     name: str
     span: SourceSpan
-    case: Located[str]
-    """The payload case whose messages set it. A route takes them, or the state never changes.
-
-    Title: Payload case
-    Example: control_mode
-    """
-    sources: Annotated[tuple[Located[str], ...], Named("source"), Listed(least=1, unique=True, alone=True)]
-    """The endpoint or endpoints whose messages set it.
-
-    Example: basestation
-    """
     value: Expression
     """An expression over the message that gives an integer, a bool or an enum. A message for which it has no value, or
     a number that the enum does not name, leaves the state unchanged and is counted as dropped.
@@ -43,9 +35,21 @@ class State:
 
     Example: MODE_MANUAL
     """
+    case: Located[str] | None = None
+    """The payload case whose messages set it. A route takes them, or the state never changes.
+
+    Title: Payload case
+    Example: control_mode
+    """
+    sources: Annotated[tuple[Located[str], ...], Named("source"), Listed(least=1, unique=True, alone=True)] = ()
+    """The endpoint or endpoints whose messages set it.
+
+    Example: basestation
+    """
+    topic: Topic | None = None
     valid_for: Annotated[Located[int] | None, VALIDITY] = None
-    """How long a message counts, from its arrival; the state is then 'initial' again. Required if the condition of a
-    command reads the state. never: until another message comes.
+    """How long a message counts, from its arrival, or for a topic from its publication or stamp; the state is then
+    'initial' again. Required if the condition of a command reads the state. never: until another message comes.
 
     Example: 5s
     Example: never

@@ -101,7 +101,8 @@ def lowered_programs() -> Iterator[Fuzzed]:
         made = check_table(table, {}).program
         assert made is not None, table
         makers = {name: _seeds_of(made.envelope, name, noise) for name in made.envelope.cases}
-        by_route = {handler.route: handler.case.name for each in made.inbound.values() for handler in each}
+        numbers = made.envelope.numbers.items()
+        by_route = {handler.route: name for name, number in numbers for handler in made.inbound.get(number, ())}
         yield from _of(made.lowered, lambda route: makers[by_route[route]], noise)  # noqa: B023 - used at once
     schema, envelope = made_wire()
     for name, fields, target, when in TO_ROS:
