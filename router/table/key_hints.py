@@ -217,6 +217,7 @@ _NAMES = {
     "choice": "a map of values",
     "literal_text": "the value of a field",
     "qos": "'qos'",
+    "state": "a state",
     "listener": "a listener",
     "endpoint": "an endpoint",
     "gateway": "a gateway",

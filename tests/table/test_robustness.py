@@ -6,10 +6,12 @@ import json
 import re
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from router.errors import Diagnostic
+from router.table.schema import keys_of, table_schema
 from tests.table.tables import GATEWAY, GOOD, load
 
 WORDS = sorted({*re.findall(r"\b(\w+):", GOOD), "extends", "auto", "ros", "any", "<<", "no", "0777", "latest", "1s"})
@@ -52,6 +54,14 @@ def test_any_text(tmp_path: Path, text: str | bytes) -> None:
 @given(trees)
 def test_any_tree(tmp_path: Path, tree: object) -> None:
     check(tmp_path, json.dumps(tree))
+
+
+KEYS = sorted({key for part in table_schema()["definitions"].values() for key in keys_of(part)})
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_any_key_in_the_wrong_place(tmp_path: Path, key: str) -> None:
+    assert check(tmp_path, json.dumps({key: None}))
 
 
 @quick

@@ -4,7 +4,7 @@
 #include <stdlib.h>
 
 #include "check.h"
-#include "state.h"
+#include "state_value.h"
 
 enum { VALUE, CHANGES, AGE, COUNTERS, INITIAL = -1, NOW = 1000, READERS = 2 };
 
