@@ -13,9 +13,10 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 from router.declared import MAX_DATAGRAM
 from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
 from router.table.model import RouteTable
+from router.types.envelopes import chosen_envelope
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
-from router.types.protobuf import Envelope, MessageClass, PayloadCase, chosen_envelope, find_envelope, load_protos
+from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
 from router.types.wire import read_varint
 
 Peer = tuple[str, int]
@@ -75,7 +76,10 @@ class Wire:
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
         if (other := self.envelope.unroutable.get(members[0])) is not None:
             raise DecodeError(f"unhandled: {members[0]} is {other.type}, not a message")
-        ((case, message),) = self.envelope.payloads_of(outer)
+        try:
+            ((case, message),) = self.envelope.payloads_of(outer)
+        except ProtobufError as error:
+            raise DecodeError(f"malformed: {_unparsed(members[0])}") from error
         *superseded, _ = payloads(self.envelope, whole, repairs=False)
         return Decoded(case, message, len(whole) - len(datagram), superseded)
 
@@ -85,7 +89,9 @@ def wire_of_table(table: RouteTable) -> Wire:
     if table.envelope is None:
         raise UsageError(f"{shown_path(table.path)} has no 'envelope', so there are no datagrams to build or parse")
     settings = table.envelope
-    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
+    schema = load_protos(
+        settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+    )
     return Wire(chosen_envelope(schema, settings.choice))
 
 
@@ -119,7 +125,13 @@ def why_rejected(envelope: Envelope, data: bytes, length: int, *, repairs: bool)
         outer = envelope.message_class.FromString(restored(data) if repairs else data)
     except ProtobufError:
         return _why_malformed(envelope, whole)
-    return ", ".join(envelope.members_of(outer)) or _why_no_payload(envelope, outer, whole)[1]
+    if not (members := envelope.members_of(outer)):
+        return _why_no_payload(envelope, outer, whole)[1]
+    try:
+        envelope.payloads_of(outer)
+    except ProtobufError:
+        return _unparsed(members[0])
+    return ", ".join(members)
 
 
 def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
@@ -131,16 +143,15 @@ def payloads(envelope: Envelope, data: bytes, *, repairs: bool) -> list[str]:
 
 
 def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tuple[str, str]:
-    """Return the reason why a parsed envelope has no payload, and the field that causes it, or ""."""
-    cases = {case.number for case in envelope.cases.values()}
-    fields = UnknownFieldSet(outer)
-    numbers = [fields[index].field_number for index in range(len(fields))]
-    if not numbers:
-        return "no_payload" if datagram else "empty", ""
-    # A payload case among the unknown fields has the wrong wire type.
-    if known := [number for number in numbers if number in cases]:
-        return "malformed", _why_malformed(envelope, datagram, f"field {known[0]} is not a message")
-    return "unknown_case", f"field {numbers[0]}"
+    """Return the reason why a parsed envelope has no payload, and the field or name that causes it, or ""."""
+    reason, detail = envelope.choice.why_none(envelope, outer)
+    if reason == "malformed":
+        return reason, _why_malformed(envelope, datagram, detail)
+    return ("empty", "") if not datagram else (reason, detail)
+
+
+def _unparsed(case: str) -> str:
+    return f"the payload is not a {case}"
 
 
 def _why_malformed(envelope: Envelope, datagram: bytes, what: str = "") -> str:

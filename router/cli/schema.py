@@ -52,9 +52,10 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the lock file. Raises TableError for broken `.proto` files or a broken lock file."""
+    from router.types.envelopes import chosen_envelope
     from router.types.lock import LockComparison
     from router.types.lock_file import read_lock, write_lock
-    from router.types.protobuf import chosen_envelope, load_protos, lock_path
+    from router.types.protobuf import load_protos, lock_path
 
     settings = _settings(args)
     path = lock_path(settings.protos, settings.lock)
@@ -62,7 +63,9 @@ def run(args: argparse.Namespace) -> int:
         what = f"{path} belongs to the installed router: the next upgrade overwrites it"
         raise UsageError(what, "copy the protos with `router init --rover DIR`, and name the copy: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
-    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
+    schema = load_protos(
+        settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+    )
     envelope = chosen_envelope(schema, settings.choice)
     lock = LockComparison(schema, envelope, None if args.protos else table_path(args))
     conflicts = lock.conflicts

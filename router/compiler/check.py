@@ -29,10 +29,11 @@ from router.table import in_order, load_table
 from router.table.model import RouteTable
 from router.table.model.endpoints import EndpointKind
 from router.table.model.targets import Topic
-from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, places
+from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, payload_fields, places
+from router.types.envelopes import chosen_envelope
 from router.types.lock import LockComparison
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, ProtoSchema, chosen_envelope, without_protos
+from router.types.protobuf import Envelope, ProtoSchema, without_protos
 
 
 @contextmanager
@@ -146,7 +147,11 @@ def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: i
     if not boards:
         return {}
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
-    return {board.name: BoardLimits(fields, limit, board.allow_non_finite) for board in boards}
+    named = {route.case.value for route in table.routes}
+    named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
+    cases = [case for name, case in envelope.cases.items() if name in named]
+    payloads = payload_fields(envelope, cases, schema.board_options)
+    return {board.name: BoardLimits(fields, limit, board.allow_non_finite, payloads) for board in boards}
 
 
 def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 
 from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.constants import envelope_of
@@ -191,9 +192,11 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, datagram: by
     The size was checked with the payload case.
     """
     envelope = lookup.envelope.message_class.FromString(datagram)
+    payloads = lookup.envelope.payloads_of(envelope)
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
-        for field, value in scalars(envelope, board.fields):
+        held = [(message, board.payload(case)) for case, message in payloads if case.number in board.payloads]
+        for field, value in chain(*(scalars(*each) for each in [(envelope, board.fields), *held])):
             if misfit := board.misfit(field, value):
                 allow = f"set `allow_non_finite: true` for '{name}' if its firmware handles {value}"
                 hint = f"send a finite number, or {allow}" if isinstance(value, float) else ""

@@ -38,23 +38,27 @@ class Definitions:
     """
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
-        self._protos: dict[tuple[Path, str, Path, tuple[str, ...]], ProtoSchema] = {}
+        self._protos: dict[tuple[Path, str, Path, tuple[str, ...], bool], ProtoSchema] = {}
         self._known = known
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Return the protos of an envelope. Raises TableError; an invalid folder is read again for each table."""
         exclude = tuple(entry.value for entry in settings.exclude)
-        key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock), exclude
+        lock = lock_path(settings.protos, settings.lock)
+        key = settings.protos.value, settings.message.value, lock, exclude, settings.has_many
         if key not in self._protos:
             known = self._unchanged(settings)
-            self._protos[key] = known or load_protos(settings.protos, settings.message, settings.lock, settings.exclude)
+            self._protos[key] = known or load_protos(
+                settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+            )
         return self._protos[key]
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
         known = self._known
         root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock)
         exclude = [entry.value for entry in settings.exclude]
-        if known is None or (known.root, known.lock, known.exclude) != (root, lock, exclude):
+        wanted = root, lock, exclude, settings.has_many
+        if known is None or (known.root, known.lock, known.exclude, known.with_others) != wanted:
             return None
         if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
             return None

@@ -43,7 +43,7 @@ def _coverage(lookup: Lookup) -> None:
     # a misspelt case is one finding, not two
     covered = {name if name in cases else nearest(name, cases) for name in names if name not in unroutable}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-    missing = [name for name in cases if name not in covered]
+    missing = [name for name in cases if name not in covered and name not in lookup.envelope.parts]
     if missing and table.routes_span is not None:  # a table with only gateways has no routes
         plural = "payload case" if len(missing) == 1 else "payload cases"
         message = f"no route for the {plural} {', '.join(missing)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
+from typing import Union
 
 from google.protobuf.descriptor import FieldDescriptor
 
@@ -21,17 +22,23 @@ _UNBOUNDED = (1 << 32) - 1
 _ZIGZAG = (FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64)
 
 
-def write_boards(boards: Mapping[str, BoardLimits], arrays: Arrays) -> Mapping[str, ctypes._Pointer[c.Board]]:
+Boards = Mapping[Union[str, tuple[str, int]], "ctypes._Pointer[c.Board]"]
+"""By endpoint; for payloads that the envelope holds as bytes, by endpoint and the number of the payload case."""
+
+
+def write_boards(boards: Mapping[str, BoardLimits], arrays: Arrays) -> Boards:
     """Make a `struct board` for each endpoint that is a board. Boards with the same firmware share its fields."""
-    trees: dict[int, _Tree] = {}
-    made = {}
+    trees: dict[tuple[int, int], _Tree] = {}
+    made: dict[str | tuple[str, int], ctypes._Pointer[c.Board]] = {}
     for name, limits in boards.items():
-        key = id(limits.fields)
-        if key not in trees:
-            trees[key] = _Tree(limits.fields, arrays)
-        messages, longest = trees[key].messages, limits.longest
-        board = c.Board(messages=messages, longest=longest, allows_non_finite=limits.allows_non_finite)
-        made[name] = ctypes.pointer(arrays.add(board))
+        for number in (0, *limits.payloads):
+            key = id(limits.fields), number
+            if key not in trees:
+                trees[key] = _Tree(limits.frame(number) if number else limits.fields, arrays)
+            board = c.Board(
+                messages=trees[key].messages, longest=limits.longest, allows_non_finite=limits.allows_non_finite
+            )
+            made[(name, number) if number else name] = ctypes.pointer(arrays.add(board))
     return made
 
 
@@ -104,5 +111,7 @@ def _wire_types(field: BoardField) -> int:
 
 def _kind(field: BoardField) -> WireKind:
     kind = wire_kind(field.descriptor)
+    if field.message is not None and kind is WireKind.BYTES:
+        return WireKind.MESSAGE  # a payload
     is_opaque = kind is WireKind.STRING or (kind is WireKind.MESSAGE and field.message is None)
     return WireKind.BYTES if is_opaque else kind

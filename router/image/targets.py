@@ -15,8 +15,10 @@ from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.refusals import DROP_REASON_NAMES
+from router.image.boards import Boards
 from router.image.openings import Openings, period
 from router.table.model.targets import OnLimit, TargetKeys
+from router.types.protobuf import PayloadCase
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
@@ -39,7 +41,7 @@ class TargetWriter:
     program: CompiledTable
     openings: Openings
     arrays: Arrays
-    boards: Mapping[str, ctypes._Pointer[c.Board]]
+    boards: Boards
     timers: list[Timer] = field(default_factory=list)
     _topics: dict[str, c.Topic] = field(default_factory=dict)
     _besides: dict[str, c.Beside] = field(default_factory=dict)
@@ -157,7 +159,7 @@ class TargetWriter:
 
     def _target(self, plan: RoutePlan, target: Target, routines: Routines | None) -> c.Target:
         counters, place = self.program.counters, (plan.route, target.label)
-        written = self._topic(target.label) if target.is_topic else self._destination(target.label)
+        written = self._topic(target.label) if target.is_topic else self._destination(target.label, plan.case)
         if routines is not None:
             routine = routines.routine
             written.condition, written.message, written.gate = map(
@@ -178,12 +180,14 @@ class TargetWriter:
         written.period, written.priority = _held_period(target.declared), c.Priority[target.priority.name]
         return written
 
-    def _destination(self, endpoint: str) -> c.Target:
+    def _destination(self, endpoint: str, case: PayloadCase | None) -> c.Target:
         written = c.Target(
             sender=self.openings.sender(endpoint), trims=self.program.table.endpoints[endpoint].trim_trailing_zeros
         )
         if endpoint in self.boards:
             written.board = self.boards[endpoint]
+            if case is not None:
+                written.board = self.boards.get((endpoint, case.number), written.board)
         return written
 
     def _beside(self, endpoint: str, beside: Beside) -> c.Beside:

@@ -9,8 +9,9 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router import declared as c
 from router.compiler.lowering.arrays import Arrays
 from router.declared import CaseBy, WireFlag, WireKind
+from router.types.case_by import ByName, ByOneof
 from router.types.descriptors import message_of
-from router.types.protobuf import Envelope
+from router.types.protobuf import Envelope, MessageClass, PayloadCase
 from router.types.undecidable import all_fields, all_types
 from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, validates_text
 
@@ -31,17 +32,38 @@ _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.
 
 def write_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
     """Write the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
-    descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
-    held = {} if envelope.choice.root else envelope.numbers
-    flags = {number: _case_flags(number, routed) for number in held.values()}
-    indexes = all_types(descriptor)
+    choice, roots = envelope.choice, [_descriptor(envelope.message_class)]
+    flags: dict[int, int] = {}
+    held: list[PayloadCase] = []
+    if isinstance(choice, ByOneof):
+        flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
+    elif isinstance(choice, ByName):
+        held = [case for case in envelope.cases.values() if case.number in routed]
+        roots += [_descriptor(case.message_class) for case in held]
+    indexes = all_types(*roots)
     types = []
     for each, index in indexes.items():
         fields = _lowered(each, indexes, {} if index else flags)
         accepts_zero = parses(each, delimited(0, b""))
         types.append(c.WireType(fields=arrays.array(c.WireField, fields), count=len(fields), accepts_zero=accepts_zero))
-    by = CaseBy[envelope.choice.by.upper()]
-    return c.WireSchema(types=arrays.array(c.WireType, types), count=len(types), case_by=by)
+    by = CaseBy[choice.kind.upper()]
+    schema = c.WireSchema(types=arrays.array(c.WireType, types), count=len(types), case_by=by)
+    if isinstance(choice, ByName):
+        checked = {case.number: indexes[_descriptor(case.message_class)] for case in held}
+        names = [_name(text, checked.get(number, 0), arrays) for text, (_, number) in choice.cases.items()]
+        schema.names, schema.name_count = arrays.array(c.WireName, names), len(names)
+        schema.name_field, schema.payload_field = choice.name[1], choice.data[1]
+    return schema
+
+
+def _descriptor(message_class: MessageClass) -> Descriptor:
+    return message_class.DESCRIPTOR  # type: ignore[return-value]  # or upb's, which is the same
+
+
+def _name(text: str, index: int, arrays: Arrays) -> c.WireName:
+    """Write the name of a case; the cases are in the order of their numbers. `index` is that of its type, or 0."""
+    data = text.encode()
+    return c.WireName(text=arrays.text(data), size=len(data), type=index)
 
 
 def _case_flags(number: int, routed: Container[int]) -> int:

@@ -105,7 +105,9 @@ class Channels:
 
 
 def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
-    return {"holds": holds.value, "number": str(case.wrapping.tag >> 3)}
+    around = case.wrapping
+    named = {"before": around.before.hex(), "after": around.after.hex()} if around.before or around.after else {}
+    return {"holds": holds.value, "number": str(around.tag >> 3), **named}
 
 
 def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:

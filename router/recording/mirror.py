@@ -270,7 +270,8 @@ class Classifier:
         self._trimming = frozenset(
             listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
         )
-        self.cases_by_tag = {varint(case.wrapping.tag): case for case in envelope.cases.values() if case.wrapping.tag}
+        alone = [case for case in envelope.cases.values() if case.wrapping.is_alone]
+        self.cases_by_tag = {varint(case.wrapping.tag): case for case in alone}
         self.frame_case = next((case for case in envelope.cases.values() if not case.wrapping.tag), None)
         """The case of an envelope that is itself the payload."""
         self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
@@ -282,10 +283,9 @@ class Classifier:
         if listener in self._trimming:
             data = restored(data)
         try:
-            envelope = self.envelope.message_class.FromString(data)
+            return next(iter(self.envelope.payloads_of(self.envelope.message_class.FromString(data))), None)
         except ProtobufError:
             return None
-        return next(iter(self.envelope.payloads_of(envelope)), None)
 
     def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
@@ -301,12 +301,10 @@ class Classifier:
         if (field := self._single_field(data)) is not None:
             return field
         try:
-            envelope = self.envelope.message_class.FromString(restored(data))
+            payloads = self.envelope.payloads_of(self.envelope.message_class.FromString(restored(data)))
         except ProtobufError:
             return None
-        for case, payload in self.envelope.payloads_of(envelope):
-            return case, payload.SerializePartialToString()
-        return None
+        return next(((case, payload.SerializePartialToString()) for case, payload in payloads), None)
 
     def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two

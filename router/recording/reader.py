@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -23,9 +23,10 @@ from router.datagrams import Peer
 from router.errors import UsageError, did_you_mean_file
 from router.recording.channels import Datagram, Event, Holds
 from router.recording.mirror import Action
-from router.recording.schemas import RecordedCase
+from router.recording.schemas import RecordedCase, wrapping_of
 from router.recording.writer import METADATA
-from router.types.wire import LEN, varint
+from router.types.case_by import Wrapping
+from router.types.wire import varint
 
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
 """Errors in files that no recorder wrote; lz4, which `mcap recover` may have used, raises RuntimeError."""
@@ -137,15 +138,15 @@ class Recording:
         """Return the payload cases of the channels outside chunks, or of all channels."""
         with self.path.open("rb") as file:
             schemas: dict[int, Schema] = {}
-            cases: dict[tuple[str, int], RecordedCase] = {}
+            cases: dict[tuple[str, Wrapping], RecordedCase] = {}
             try:
                 for record in StreamReader(file, emit_chunks=emit_chunks, record_size_limit=self.size).records:
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel) and "number" in record.metadata:
                         case, schema = record.topic.rpartition("/")[2], schemas[record.schema_id]
-                        number = int(record.metadata["number"])
-                        cases.setdefault((case, number), RecordedCase(case, number, schema.name, schema.data))
+                        around = wrapping_of(record.metadata)
+                        cases.setdefault((case, around), RecordedCase(case, around, schema.name, schema.data))
             except _DAMAGED:
                 pass
         return [*cases.values()]
@@ -180,22 +181,23 @@ def _decoder(metadata: dict[str, str]) -> _Decoder:
     if holds == Holds.EVENT.value:
         return _event
     if holds == Holds.SENT.value:
-        rebuilt = _rebuild(metadata["number"])
+        rebuilt = _rebuild(metadata)
         what, route, target, topic = (metadata[key] for key in ("what", "route", "endpoint", "ros"))
         return lambda at, payload: Action(at, what, route, target, topic, data=rebuilt(payload))
     if holds != Holds.PAYLOAD.value:
         return lambda *_: None  # the datagram is elsewhere in the recording
-    rebuilt, peer = _rebuild(metadata["number"]), _peer(metadata["peer"])
+    rebuilt, peer = _rebuild(metadata), _peer(metadata["peer"])
     listener, endpoint = metadata["listener"], metadata["endpoint"]
     return lambda _, payload: (listener, peer, endpoint, reason, rebuilt(payload))
 
 
-def _rebuild(number: str) -> Callable[[bytes], bytes]:
-    """Return a function that puts a payload into an envelope, as the field with this number; 0 if it has none."""
-    if not int(number):
+def _rebuild(metadata: Mapping[str, str]) -> Callable[[bytes], bytes]:
+    """Return a function that puts a payload into an envelope, as the metadata of its channel say."""
+    around = wrapping_of(metadata)
+    if not around.tag:
         return lambda payload: payload
-    tag = varint(int(number) << 3 | LEN)
-    return lambda payload: b"".join((tag, varint(len(payload)), payload))
+    before = around.before + varint(around.tag)
+    return lambda payload: b"".join((before, varint(len(payload)), payload, around.after))
 
 
 def _raw(reason: str, _: int, message: bytes) -> _Decoded:

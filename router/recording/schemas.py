@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
@@ -10,52 +10,86 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from router.declared import ONLY_CASE
-from router.types.case_by import ByFrame, ByOneof, Wrapping
+from router.types.case_by import ByFrame, ByName, ByOneof, Choice, Wrapping
 from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types
+from router.types.wire import LEN, read_varint
 
 _FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "payload"
+_NAME_FIELD, _DATA_FIELD = "name", "data"
+_TEXT, _BYTES = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTES
+_OPTIONAL = FieldDescriptorProto.LABEL_OPTIONAL
 
 
 class RecordedCase(NamedTuple):
-    """A payload case. `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares.
+    """A payload case, and how its envelope holds it.
 
-    `number` is that of the field that holds it; 0 for the only case of an envelope that is itself the payload.
+    `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares.
     """
 
     name: str
-    number: int
+    around: Wrapping
     message: str
     schema: bytes
 
 
+def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
+    """Return how an envelope holds the payloads of a channel, from its metadata."""
+    number = int(metadata["number"])
+    before, after = (bytes.fromhex(metadata.get(key, "")) for key in ("before", "after"))
+    return Wrapping(number << 3 | LEN if number else 0, before, after)
+
+
 def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
     """Return an envelope with these cases. If the protos changed during the recording, the first ones are used."""
-    named = {case.number: case for case in sorted(cases, reverse=True)}
+    known = {(case.around.tag, case.around.before, case.around.after): case for case in sorted(cases, reverse=True)}
     pool, files = DescriptorPool(), dict[str, FileDescriptorProto]()
-    for case in named.values():
+    for case in known.values():
         for file in FileDescriptorSet.FromString(case.schema).file:
             if files.setdefault(file.name, file) is file:
                 pool.AddSerializedFile(file.SerializeToString())
-    own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
-    message = own.message_type.add(name="Recorded")
-    frame = named.pop(0, None)
-    if named:  # protobuf refuses an empty oneof
-        message.oneof_decl.add(name=_ONEOF)
-    for number, case in named.items():
-        kind, label = FieldDescriptorProto.TYPE_MESSAGE, FieldDescriptorProto.LABEL_OPTIONAL
-        message.field.add(
-            name=case.name, number=number, type=kind, label=label, type_name=f".{case.message}", oneof_index=0
-        )
-    pool.AddSerializedFile(own.SerializeToString())
     types, _ = build_types(pool, [*files], {}, lambda _: NO_OPTIONS)
 
-    def made(case: RecordedCase, number: int, wrapped: Wrapping | None = None) -> PayloadCase:
+    def made(case: RecordedCase, number: int) -> PayloadCase:
         message_class = GetMessageClass(pool.FindMessageTypeByName(case.message))
-        return PayloadCase(case.name, number, types[case.message], message_class, None, wrapped)
+        return PayloadCase(case.name, number, types[case.message], message_class, None, case.around)
 
-    if frame is not None:
-        only = made(frame, ONLY_CASE, Wrapping(0))
+    own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
+    message = own.message_type.add(name="Recorded")
+    inside = sorted((case for case in known.values() if case.around.is_alone), key=lambda case: case.around.tag)
+    named = [case for case in known.values() if case.around.tag and not case.around.is_alone]
+    choice: Choice = ByOneof(_ONEOF)
+    if frame := next((case for case in known.values() if not case.around.tag), None):
+        only = made(frame, ONLY_CASE)
         return Envelope(frame.message, ByFrame(frame.name), only.message_class, {only.name: only}, 0)
-    payload_cases = {case.name: made(case, number) for number, case in sorted(named.items())}
-    return Envelope(_NAME, ByOneof(_ONEOF), GetMessageClass(pool.FindMessageTypeByName(_NAME)), payload_cases, 0)
+    if named:
+        numbered = [(made(case, number), *_name_of(case.around)) for number, case in enumerate(named, 1)]
+        payload_cases = [case for case, *_ in numbered]
+        fields = (_NAME_FIELD, numbered[0][1]), (_DATA_FIELD, named[0].around.tag >> 3)
+        choice = ByName(*fields, {text: (case.name, case.number) for case, _, text in numbered})
+        for (name, number), kind in zip(fields, (_TEXT, _BYTES), strict=True):
+            message.field.add(name=name, number=number, type=kind, label=_OPTIONAL)
+    else:
+        payload_cases = [made(case, case.around.tag >> 3) for case in inside]
+        if inside:  # protobuf refuses an empty oneof
+            message.oneof_decl.add(name=_ONEOF)
+        for each in payload_cases:
+            message.field.add(
+                name=each.name,
+                number=each.number,
+                type=FieldDescriptorProto.TYPE_MESSAGE,
+                label=_OPTIONAL,
+                type_name=f".{each.type.name}",
+                oneof_index=0,
+            )
+    pool.AddSerializedFile(own.SerializeToString())
+    by_name = {case.name: case for case in payload_cases}
+    return Envelope(_NAME, choice, GetMessageClass(pool.FindMessageTypeByName(_NAME)), by_name, 0)
+
+
+def _name_of(around: Wrapping) -> tuple[int, str]:
+    """Return the number of the field with the name of a message, and the name."""
+    field = around.before or around.after
+    tag, position = read_varint(field, 0)
+    _, position = read_varint(field, position)
+    return tag >> 3, field[position:].decode()

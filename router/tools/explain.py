@@ -234,7 +234,7 @@ def _waiting(served: Target) -> Iterator[str]:
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
     """Yield the limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
-    payload, prefix = board.payload(case.wrapping), f"{case.name}."
+    payload, prefix = board.payload(case), f"{case.name}."
     fields = list(_bounded(payload))
     if any(field.is_float for field in fields):
         yield "NaN and infinity allowed" if board.allows_non_finite else "no NaN or infinity"

@@ -16,10 +16,11 @@ from router.table.model import RouteTable
 from router.table.model.endpoints import EndpointKind
 from router.table.model.routes import ANY, Route
 from router.tools.new_message import SCALARS, NewField, NewMessage, Site
+from router.types.envelopes import chosen_envelope
 from router.types.lock import LockComparison
 from router.types.lock_file import lock_text
 from router.types.model import Bool, Enum, Float, MessageType, Type
-from router.types.protobuf import chosen_envelope, load_protos
+from router.types.protobuf import load_protos
 
 _WIDEST = 120
 _LONGEST_FIELD = 60

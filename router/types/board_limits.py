@@ -7,17 +7,20 @@ compiler checks the payloads of deadmen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 
 from router.errors import plural
 from router.types.boards import OptionsOf, integers, is_list, is_required, longest, stored_type, why_unbounded
-from router.types.case_by import Wrapping
 from router.types.descriptors import message_of
 from router.types.model import Int
+
+if TYPE_CHECKING:
+    from router.types.protobuf import Envelope, PayloadCase
 
 MOST_MESSAGES, MOST_LISTS = 65536, 4096
 """Maximum number of messages and of lists, nested ones included, in the envelope of a board."""
@@ -81,18 +84,29 @@ def scalars(message: Message, fields: BoardMessage) -> Iterator[tuple[BoardField
 
 @dataclass(frozen=True, slots=True)
 class BoardLimits:
-    """The limits of one board. `longest` is the size of its largest envelope in bytes."""
+    """The limits of one board. `longest` is the size of its largest envelope in bytes.
+
+    `fields` are those of the envelope. If it holds payloads as bytes, `payloads` are theirs, as a field by the number
+    of the payload case.
+    """
 
     fields: BoardMessage
     longest: int
     allows_non_finite: bool
+    payloads: Mapping[int, BoardField] = field(default_factory=dict)
 
-    def payload(self, wrapping: Wrapping) -> BoardMessage:
-        """Return the fields of a payload that the envelope holds like this."""
-        if not wrapping.tag:
+    def payload(self, case: PayloadCase) -> BoardMessage:
+        """Return the fields of a payload."""
+        tag = case.wrapping.tag
+        if not tag:
             return self.fields
-        held = self.fields.get(wrapping.tag >> 3)
+        held = self.payloads.get(case.number) or self.fields.get(tag >> 3)
         return held.message or {} if held is not None else {}
+
+    def frame(self, number: int) -> BoardMessage:
+        """Return the fields of an envelope with a payload of the case with this number, which it holds as bytes."""
+        held = self.payloads[number]
+        return {**self.fields, held.descriptor.number: held}
 
     def misfit(self, field: BoardField, value: object) -> str:
         """Return why a scalar of a payload does not fit its field; empty if it does."""
@@ -106,6 +120,19 @@ class BoardLimits:
         size = len(value.encode() if isinstance(value, str) else value)
         fits = size in (0, field.longest) if field.has_fixed_length else size <= field.longest
         return "" if fits else f"{field.path} has {plural(size, 'byte')}; the board takes {field.longest}"
+
+
+def payload_fields(envelope: Envelope, cases: Iterable[PayloadCase], options_of: OptionsOf) -> Mapping[int, BoardField]:
+    """Return the payloads that an envelope holds as bytes, as fields, by the number of the payload case."""
+    descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
+    fields = {}
+    for case in cases:
+        holder = descriptor.fields_by_number.get(case.wrapping.tag >> 3)
+        if holder is not None and holder.type == FieldDescriptor.TYPE_BYTES:
+            payload: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # likewise
+            message = board_fields(payload, options_of, case.name)
+            fields[case.number] = BoardField(case.name, holder, message=message)
+    return fields
 
 
 def board_fields(

@@ -7,7 +7,7 @@ an int32 takes up to 10 bytes, an enum as many as its largest declared value.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -92,10 +92,13 @@ def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
 
 def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
     """Return the largest encoding of a message without one of its oneofs. Fields without a bound do not count."""
-    message = oneof.containing_type
-    unbounded = {field.path[0] for field in unbounded_fields(message, options_of)}
-    members = {*oneof.fields, *unbounded}
-    return _size_of([field for field in message.fields if field not in members], options_of)
+    return largest_fields([field for field in oneof.containing_type.fields if field not in oneof.fields], options_of)
+
+
+def largest_fields(fields: Sequence[FieldDescriptor], options_of: OptionsOf) -> int:
+    """Return the largest encoding of some fields of a message. Fields without a bound do not count."""
+    unbounded = {field.path[0] for field in unbounded_fields(container(fields[0]), options_of)} if fields else set()
+    return _size_of([field for field in fields if field not in unbounded], options_of)
 
 
 def member_size(field: FieldDescriptor, options_of: OptionsOf) -> int | None:
@@ -192,6 +195,12 @@ def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: Sou
     board.
     """
     member = schema.descriptor(schema.envelope).fields_by_number.get(case.wrapping.tag >> 3)
+    if member is not None and member.type == FieldDescriptor.TYPE_BYTES:
+        most = longest(member, schema.board_options(member))
+        if most is not None and case.max_size is not None and case.max_size > most:
+            message = f"{case.name} takes up to {case.max_size} bytes; {member.full_name} has room for {most}"
+            hint = f"see {schema.span(schema.envelope, member.name)}; give it room, or make the message smaller"
+            return [Diagnostic(span, Code.BOARD_PAYLOAD, message, hint)]
     if member is not None and schema.board_options(member).is_ignored:
         message = f"a board ignores {case.name}: nanopb's options leave it out of the firmware"
         hint = f"see {schema.span(schema.envelope, member.name)}; remove `type:FT_IGNORE`"

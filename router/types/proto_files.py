@@ -244,6 +244,10 @@ _FURTHER_UP = 4
 _OF_PROTOBUF = "google/protobuf/"
 
 
+ANY, _FILE_OF_ANY = "google.protobuf.Any", "google/protobuf/any.proto"
+"""An envelope of protobuf's own, which no file of the folder has to import."""
+
+
 def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], locked: Lock | None) -> tuple[str, str]:
     """Return the file that declares the envelope, and its full name there. Prefers the one in the lock.
 
@@ -252,6 +256,8 @@ def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], 
     wanted = message.value
     declared = declaring(wanted, folder.protos)
     declarations = [(file, name) for file, name in declared if name in scan(folder.files[file]).messages]
+    if not declarations and wanted == ANY:
+        return _FILE_OF_ANY, ANY
     if not declarations:
         raise TableError(_missing(folder, protos, message))
     envelope = locked.messages.get(locked.message) if locked is not None else None

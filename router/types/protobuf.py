@@ -23,7 +23,6 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
 from router import inputs
-from router.declared import ONLY_CASE
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, plural, shown_path
 from router.types.boards import (
     largest_beside,
@@ -32,7 +31,7 @@ from router.types.boards import (
     member_size,
     unbounded_fields,
 )
-from router.types.case_by import ByFrame, ByOneof, Choice, Wrapping
+from router.types.case_by import ByOneof, Choice, Wrapping
 from router.types.descriptors import declared_type, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
@@ -68,6 +67,7 @@ class ProtoSchema:
         self.envelope = envelope
         self.lock = lock
         self.exclude: Sequence[str] = ()
+        self.with_others = False
         self.inputs = inputs.Inputs()
         own = [file for file in compiled.file if inputs.is_file(folder.root / file.name)]
         self.files = tuple(file.name for file in own if not declares_options(file))
@@ -166,7 +166,8 @@ class Envelope:
     """The message around every payload, by full name. `beside` has only its fields beside the payload.
 
     `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. `choice` says
-    which of the `cases` a frame holds; `unroutable` are those that no route can take.
+    which of the `cases` a frame holds; `unroutable` are those that no route can take, `parts` those that are also parts
+    of other messages, and therefore need no route.
     """
 
     name: str
@@ -176,6 +177,7 @@ class Envelope:
     max_size: int
     unroutable: Mapping[str, Unroutable] = field(default_factory=dict)
     beside: MessageType = field(default_factory=lambda: MessageType(""))
+    parts: frozenset[str] = frozenset()
 
     @property
     def numbers(self) -> Mapping[str, int]:
@@ -188,16 +190,19 @@ class Envelope:
         return self.choice.members_of(frame) if self.cases or self.unroutable else ()
 
     def payloads_of(self, frame: Message) -> list[tuple[PayloadCase, Message]]:
-        """Return the payloads of a parsed frame that a route can take, with their cases."""
+        """Return the payloads of a parsed frame that a route can take, with their cases.
+
+        Raises protobuf's DecodeError.
+        """
         cases = (self.cases[name] for name in self.members_of(frame) if name in self.cases)
-        return [(case, self.choice.payload(frame, case.name)) for case in cases]
+        return [(case, self.choice.payload(frame, case)) for case in cases]
 
     def around(self, case: PayloadCase, payload: Message, beside: Message | None = None) -> Message:
         """Return an envelope with this payload, even an empty one, and with the other fields of `beside`."""
         envelope = self.message_class()
         if beside is not None:
             envelope.CopyFrom(beside)
-        self.choice.put(envelope, case.name, payload)
+        self.choice.put(envelope, case, payload)
         return envelope
 
 
@@ -217,6 +222,7 @@ def load_protos(
     with inputs.noted() as read:
         schema = _load(protos, message, lock, exclude, with_others=with_others)
     schema.exclude = [entry.value for entry in exclude]
+    schema.with_others = with_others
     schema.inputs = read
     return schema
 
@@ -363,27 +369,6 @@ def _with_reserved_number(file: FileDescriptorProto) -> list[str]:
 _RESERVED_NUMBERS = range(FieldDescriptor.FIRST_RESERVED_FIELD_NUMBER, FieldDescriptor.LAST_RESERVED_FIELD_NUMBER + 1)
 
 
-def chosen_envelope(schema: ProtoSchema, choice: Mapping[str, Located[str]]) -> Envelope:
-    """Return the envelope of the schema. `choice` are the keys of the table that say how it holds payloads.
-
-    Raises TableError.
-    """
-    if "oneof" in choice:
-        return find_envelope(schema, choice["oneof"])
-    return framed_envelope(schema, choice["case"])
-
-
-def framed_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
-    """Return an envelope that is the payload itself; `named` is the name of its only case. Raises TableError."""
-    message = schema.descriptor(schema.envelope)
-    if refused := list(undecidable(message, (), schema.place)):
-        raise TableError(refused)
-    size = largest_encoding(message, schema.board_options)
-    made = schema.message_class(schema.envelope)
-    case = PayloadCase(named.value, ONLY_CASE, schema.messages[schema.envelope], made, size, Wrapping(0))
-    return Envelope(schema.envelope, ByFrame(named.value), made, {case.name: case}, size or 0)
-
-
 def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     """Return the envelope of the schema, with its oneof `named`.
 
@@ -395,7 +380,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     if oneof is None:
         message = f"{name} has no oneof '{named.value}'"
         raise TableError.of(named.span, Code.BAD_VALUE, message, _oneof_hint(schema, named.value))
-    if refused := list(undecidable(descriptor, {field.number for field in oneof.fields}, schema.place)):
+    if refused := list(undecidable([descriptor], {field.number for field in oneof.fields}, schema.place)):
         raise TableError(refused)
     messages = [field for field in oneof.fields if field.type == FieldDescriptor.TYPE_MESSAGE]
     others = [field for field in oneof.fields if field.type != FieldDescriptor.TYPE_MESSAGE]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
@@ -19,9 +19,12 @@ _Found = tuple[str, str, str]
 """The full name of a declaration, what is wrong with it, and what to do."""
 
 
-def undecidable(envelope: Descriptor, members: Container[int], place: Place) -> list[Diagnostic]:
-    """Return findings about an envelope and all types in it. `members` are the numbers of the oneof's members."""
-    types = all_types(envelope)
+def undecidable(roots: Sequence[Descriptor], members: Container[int], place: Place) -> list[Diagnostic]:
+    """Return findings about an envelope, other messages, and all types in them.
+
+    The envelope is the first of `roots`. `members` are the numbers of the oneof's members.
+    """
+    envelope, types = roots[0], all_types(*roots)
     faults = [*_of_envelope(envelope, members), *(fault for descriptor in types for fault in _of_type(descriptor))]
     if len(types) > MOST_TYPES:
         what = f"{envelope.full_name} contains {len(types)} message types; the limit is {MOST_TYPES}"
@@ -46,9 +49,10 @@ def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
             yield field.full_name, what, "make it a message"
 
 
-def all_types(envelope: Descriptor) -> dict[Descriptor, int]:
-    """Return the envelope and all types of its fields, at any depth, each with an index; the envelope's is 0."""
-    indexes, pending = {envelope: 0}, [envelope]
+def all_types(*roots: Descriptor) -> dict[Descriptor, int]:
+    """Return these messages and all types of their fields, at any depth, each with an index; the first one's is 0."""
+    indexes = {root: index for index, root in enumerate(dict.fromkeys(roots))}
+    pending = [*indexes]
     while pending:
         for field in all_fields(pending.pop()):
             if field.message_type is not None and field.message_type not in indexes:

@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
-from tests.envelopes import I32, I64, LEN, VARINT, tag, varint
+from router.types.case_by import ByName
+from router.types.protobuf import Envelope
+from tests.envelopes import I32, I64, LEN, VARINT, framed, tag, varint
 from tests.mutations import MUTATIONS
 
 GROUP, GROUP_END = 3, 4
@@ -22,6 +24,15 @@ _EDGES = (
     b"\xc1\xbf", b"\xe0\x9f\xbf", b"\xed\xa0\x80", b"\xf0\x8f\xbf\xbf", b"\xf4\x90\x80\x80", b"\xf5\x80\x80\x80",
     b"\x80", b"\xc2", b"\xe1\x80", b"\xf1\x80\x80", b"\xff", b"a\xe2\x82", b"\xc2\x80\x80", b"\xe2\x28\xa1",
 )  # fmt: skip
+
+
+def maker_for(envelope: Envelope, noise: random.Random) -> Maker:
+    descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's
+    if not isinstance(envelope.choice, ByName):
+        return Maker(descriptor, noise)
+    cases = [case.message_class.DESCRIPTOR for case in envelope.cases.values()]
+    numbers = envelope.choice.name[1], envelope.choice.data[1]
+    return NamedMaker(descriptor, noise, cases, *numbers)  # type: ignore[arg-type]  # or upb's
 
 
 class Maker:
@@ -168,3 +179,25 @@ class Maker:
         if self._noise.random() < 0.02:
             return b"\xff" * 9 + self._noise.choice((b"\0", b"\1", b"\2", b"\x7f", b"\xff\1"))
         return self._stretched(varint(value))
+
+
+class NamedMaker(Maker):
+    """Makes envelopes with the name of a message and its bytes, usually one of each."""
+
+    def __init__(
+        self, envelope: Descriptor, noise: random.Random, cases: Sequence[Descriptor], name: int, data: int
+    ) -> None:
+        super().__init__(envelope, noise)
+        self._cases = cases
+        self._name, self._data = name, data
+
+    def envelope(self) -> bytes:
+        noise, case = self._noise, self._noise.choice(self._cases)
+        names = case.full_name, case.full_name.lower(), f"/{case.full_name}", case.full_name[:-1], ""
+        texts = [noise.choices(names, (20, 1, 1, 1, 1))[0].encode() for _ in range(noise.choice((0, 1, 1, 1, 1, 1, 2)))]
+        payload = Maker(case, noise)
+        parts = [framed(self._name, text) for text in texts]
+        parts += [framed(self._data, payload.message()) for _ in range(noise.choice((0, 1, 1, 1, 1, 1, 2)))]
+        parts += [b"".join((tag(noise.choice((1, 2, 3, 99)), VARINT), b"\1"))] * noise.choice((0, 0, 0, 1))
+        noise.shuffle(parts)
+        return b"".join(parts)

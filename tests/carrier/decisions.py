@@ -20,7 +20,7 @@ from tests.tables import PROTOS
 TESTS = Path(__file__).parents[1]
 
 HEAD = """version: 1
-envelope: {protos: PROTOS, message: PBEnvelope, CHOICE}
+envelope: {protos: PROTOS, CHOICE}
 listen:
   trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}
   exact: {address: 127.0.0.1:5001, framing: exact}
@@ -30,12 +30,14 @@ endpoints:
 routes:
 """
 
+ONEOF = "message: PBEnvelope, oneof: payload"
 HARD = TESTS / "carrier" / "protos"
 SCHEMAS = {
-    "rover": (PROTOS, "oneof: payload", ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
-    "every_kind": (TESTS / "protos", "oneof: payload", ["every_kind"]),
-    "hard": (HARD, "oneof: payload", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
-    "frame": (HARD, "case: frame", ["frame"]),
+    "rover": (PROTOS, ONEOF, ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
+    "every_kind": (TESTS / "protos", ONEOF, ["every_kind"]),
+    "hard": (HARD, ONEOF, ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
+    "frame": (HARD, "message: PBEnvelope, case: frame", ["frame"]),
+    "name": (HARD, "message: Wrapped, case: name, payload: data", ["Nothing", "Tree", "Texts", "Scalars", "Maps"]),
 }
 """Folders of protos, how the envelope says which message it holds, and the payload cases with a route."""
 

@@ -17,13 +17,13 @@ from router.compiler.compiled_table import CompiledTable
 from router.declared import MAX_DATAGRAM
 from router.errors import Code
 from router.types.wire import read_varint
-from tests.carrier.datagrams import GROUP, GROUP_END, Maker
-from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, table
+from tests.carrier.datagrams import GROUP, GROUP_END, maker_for
+from tests.carrier.decisions import HEAD, ONEOF, SCHEMAS, CarrierSide, table
 from tests.envelopes import I32, I64, LEN, VARINT, damaged, framed, tag, varint
 from tests.oracles.envelopes import Decision, decide
 from tests.small_tables import program
 
-ONEOF_HEAD = HEAD.replace("CHOICE", "oneof: payload")
+ONEOF_HEAD = HEAD.replace("CHOICE", ONEOF)
 Sides = tuple[CompiledTable, CarrierSide]
 
 
@@ -59,8 +59,7 @@ def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
 def test_pieces_of_the_wire_format(
     sides: Mapping[str, Sides], schema: str, noise: random.Random, repairs: bool
 ) -> None:
-    descriptor = sides[schema][0].envelope.message_class.DESCRIPTOR
-    decided(sides[schema], Maker(descriptor, noise).datagram(), repairs)  # type: ignore[arg-type]  # or upb's
+    decided(sides[schema], maker_for(sides[schema][0].envelope, noise).datagram(), repairs)
 
 
 @given(data=damaged(), repairs=st.booleans())
@@ -77,7 +76,7 @@ def test_any_bytes(sides: Mapping[str, Sides], schema: str, data: bytes, repairs
 @pytest.mark.parametrize("schema", SCHEMAS)
 @pytest.mark.parametrize("seed", [*range(20), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(20, 100))])
 def test_a_thousand_of_each_seed(sides: Mapping[str, Sides], schema: str, seed: int) -> None:
-    maker = Maker(sides[schema][0].envelope.message_class.DESCRIPTOR, random.Random(seed))  # type: ignore[arg-type]
+    maker = maker_for(sides[schema][0].envelope, random.Random(seed))
     for _ in range(1000):
         decided(sides[schema], maker.datagram(), seed % 3 != 0)
 

@@ -10,7 +10,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from router.types.case_by import ByFrame
+from router.types.case_by import ByFrame, ByName, ByOneof
 from router.types.framing import restored
 from router.types.protobuf import Envelope
 from router.types.wire import LEN
@@ -39,13 +39,15 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     try:
         parsed: Message = envelope.message_class.FromString(whole)
     except DecodeError:
-        number = None if isinstance(envelope.choice, ByFrame) else _only_payload(envelope, routed, data)
+        number = None if not isinstance(envelope.choice, ByOneof) else _only_payload(envelope, routed, data)
         return Decision(None, number, False) if number else Decision("malformed", 0, False)
     is_repaired = len(whole) != len(data)
     if isinstance(envelope.choice, ByFrame):
         return Decision(None, envelope.numbers[envelope.choice.case], is_repaired)
     if not data:
         return Decision("empty", 0, False)
+    if isinstance(envelope.choice, ByName):
+        return _decide_by_name(envelope, envelope.choice, routed, parsed, whole, is_repaired)
     if name := parsed.WhichOneof(envelope.choice.oneof):
         return Decision(None, envelope.numbers[name], is_repaired, _superseded(envelope, whole))
     fields = UnknownFieldSet(parsed)
@@ -55,6 +57,31 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     cases = {case.number for case in envelope.cases.values()}
     mistyped = [number for number in unknown if number in cases]
     return Decision("malformed" if mistyped else "unknown_case", [*mistyped, *unknown][0], is_repaired)
+
+
+def _decide_by_name(
+    envelope: Envelope, by: ByName, routed: Container[int], parsed: Message, whole: bytes, is_repaired: bool
+) -> Decision:
+    unknown = UnknownFieldSet(parsed)
+    numbers = {unknown[index].field_number for index in range(len(unknown))}
+    name, data = getattr(parsed, by.name[0]), getattr(parsed, by.data[0])
+    if not name:
+        is_mistyped = by.name[1] in numbers
+        return Decision("malformed" if is_mistyped else "no_payload", by.name[1] if is_mistyped else 0, is_repaired)
+    case = envelope.cases.get(name)
+    if case is None:
+        return Decision("unknown_case", 0, is_repaired)
+    fields = UnknownFieldSet(Empty.FromString(whole))
+    found = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
+    names, payloads = found.count((by.name[1], LEN)), found.count((by.data[1], LEN))
+    if by.data[1] in numbers and not data:
+        return Decision("malformed", by.data[1], is_repaired)
+    try:
+        if case.number in routed:
+            case.message_class.FromString(data)
+    except DecodeError:
+        return Decision("malformed", 0, is_repaired)
+    return Decision(None, case.number, is_repaired, max(names, payloads) - 1)
 
 
 def _superseded(envelope: Envelope, whole: bytes) -> int:

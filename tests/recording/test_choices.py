@@ -20,6 +20,12 @@ from tests.recording.recorder_rig import START, Listed, shown, write
 TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
 
 FRAMED = [b"\x08\x02\x10\x02", b"", b"\x08\x03\x22\x07\x08\x00\x15", b"\x08\x03\0\0", b"\x22\x02\x08"]
+NAMED = [
+    b"\x0a\x06Status\x12\x02\x08\x05",
+    b"\x0a\x0bburt.Status",
+    b"\x12\x02\x08\x01\x18\x01\x0a\x0bburt.Status",
+    b"\x0a\x0bburt.Status\x12\x04\x12\x02a",
+]
 
 
 def program(table: str) -> CompiledTable:
@@ -28,7 +34,7 @@ def program(table: str) -> CompiledTable:
     return made
 
 
-@pytest.mark.parametrize(("table", "datagrams"), [("framed.yaml", FRAMED)])
+@pytest.mark.parametrize(("table", "datagrams"), [("framed.yaml", FRAMED), ("named.yaml", NAMED)])
 def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tmp_path: Path) -> None:
     made = program(table)
     batch = [shown(data, START + number) for number, data in enumerate(datagrams)]

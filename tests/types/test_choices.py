@@ -64,3 +64,25 @@ def test_new_messages_are_members_of_a_oneof(folder: Path, capsys: pytest.Captur
     write_table(folder, FRAME)
     assert main(["new", "BoardState", "--number", "2", "--board", "board", "-t", "table.yaml"]) == BAD_USAGE
     assert "an envelope without a oneof" in capsys.readouterr().err
+
+
+NAMED = "message: Wrapped, case: name, payload: data"
+WRAPPED = """syntax = "proto3";
+message Wrapped { string name = 1; bytes data = 2; }
+message Part { uint32 number = 1; }
+message Whole { repeated Part parts = 1; Whole inner = 2; message Nested { bool flag = 1; } }
+"""
+
+
+def test_each_message_is_a_case_and_parts_of_others_need_no_route(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "protos" / "a.proto").write_text(REFEREE)
+    (folder / "protos" / "b.proto").write_text(WRAPPED)
+    write_table(folder, NAMED, "Referee")
+    assert main(["schema", "lock", "--table", "table.yaml"]) == OK
+    lock = json.loads((folder / "protos" / "envelope.lock.json").read_text())
+    assert lock["envelope"]["by"] == "name: name, data"
+    assert lock["messages"].keys() == {"Referee", "Wrapped", "Part", "Whole", "Whole.Nested"}
+    assert main(["validate", "table.yaml"]) == OK
+    assert "no route for the payload case Whole\n" in capsys.readouterr().out

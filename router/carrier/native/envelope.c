@@ -93,7 +93,7 @@ static bool read_field(struct walk *walk) {
     return skip_scalar(&walk->rest, wire_type);
 }
 
-static bool is_well_formed(const struct wire_schema *schema, const struct wire_type *type, struct bytes message) {
+bool is_well_formed(const struct wire_schema *schema, const struct wire_type *type, struct bytes message) {
     struct walk walk; /* only entered levels are initialized, as it is large */
     walk.schema = schema;
     walk.rest = message;
@@ -169,6 +169,7 @@ size_t envelope_restored_size(const uint8_t *data, size_t size) {
 static int (*const FIND_CASE[])(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope) = {
     [BY_ONEOF] = find_by_oneof,
     [BY_FRAME] = find_by_frame,
+    [BY_NAME] = find_by_name,
 };
 
 int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, bool repairs,

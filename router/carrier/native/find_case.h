@@ -15,6 +15,10 @@
 
 int find_by_oneof(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope);
 int find_by_frame(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope);
+int find_by_name(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope);
+
+/* Whether protobuf would parse a message of this type. */
+bool is_well_formed(const struct wire_schema *schema, const struct wire_type *type, struct bytes message);
 
 static inline const struct wire_field *find_wire_field(const struct wire_type *type, uint32_t number) {
     const struct wire_field *fields = type->fields;

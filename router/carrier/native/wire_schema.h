@@ -26,14 +26,27 @@ struct wire_type {
 /* How an envelope says which message it holds. */
 enum case_by {
     BY_ONEOF, /* the member of a oneof */
-    BY_FRAME  /* the frame is the message of the only case, ONLY_CASE */
+    BY_FRAME, /* the frame is the message of the only case, ONLY_CASE */
+    BY_NAME   /* a field with the name of the message, and one with its bytes */
 };
 enum { ONLY_CASE = 1 };
+
+/* What names a case. Its number is its index + 1. */
+struct wire_name {
+    const uint8_t *text;
+    uint32_t size;
+    uint16_t type; /* of its messages; 0 if they are not checked, because no route takes them */
+    uint16_t reserved;
+};
 
 struct wire_schema {
     const struct wire_type *types; /* the first one is the envelope */
     uint32_t count;
     uint32_t case_by;
+    /* BY_NAME: the names of the cases in the order of their bytes, and the numbers of the fields. */
+    const struct wire_name *names;
+    uint32_t name_count, name_field, payload_field;
+    uint32_t reserved;
 };
 
 #endif

@@ -29,9 +29,11 @@ def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase, beside
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
     place = Place(plan.span, "")
     inside = _Writer(lowering).record(plan, descriptor, "")
-    before = at(place, known(beside)) if beside else []
-    tag = case.wrapping.tag
-    return list(merged([*before, *(_delimited(tag, inside, place) if tag else inside)]))
+    around = case.wrapping
+    if around.tag:
+        inside = _lengthened(around.tag, list(merged(inside)), place, is_always=not around.is_optional)
+    before, after = (at(place, known(data)) if data else [] for data in (beside + around.before, around.after))
+    return list(merged([*before, *inside, *after]))
 
 
 def protobuf_fields(lowering: Lowering, plan: Record, descriptor: Descriptor) -> list[Placed]:

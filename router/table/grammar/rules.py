@@ -59,7 +59,10 @@ COMPLETE: Schema = {
                 "required": ["message"],
                 "if": {"required": ["case"]},
                 "then": without("oneof", "is not allowed with 'case': with it, the datagram itself is the message"),
-                "else": {"required": ["oneof"]},
+                "else": {
+                    "required": ["oneof"],
+                    **without("payload", "needs 'case', the field that names the message"),
+                },
             },
             "http": {"required": ["address"]},
             "record": {"required": required(RecordSettings)},

@@ -38,10 +38,19 @@ class EnvelopeSettings:
     Example: payload
     """
     case: Annotated[Located[str] | None, Shape("node_name")] = None
-    """Instead of `oneof`: the datagram is itself the message of a single payload case, which gets this name.
+    """Instead of `oneof`. Alone: the datagram is itself the message of a single payload case, which gets this name.
+    With `payload`: the field of the envelope that names the message.
 
-    Title: The only payload case
+    Title: Only case, or field with its name
     Example: referee
+    Example: name
+    """
+    payload: Annotated[Located[str] | None, Shape("node_name")] = None
+    """The field of the envelope with the bytes of the message that the field `case` names by its full name. Each
+    message of `protos` is a payload case.
+
+    Title: Field with the payload
+    Example: data
     """
     lock: Located[Path] | None = None
     """The file that records the field numbers, relative to this file. Default: envelope.lock.json in the folder of the
@@ -67,9 +76,14 @@ class EnvelopeSettings:
 
     @property
     def choice(self) -> Mapping[str, Located[str]]:
-        """The keys that say how the envelope holds payloads: one of `oneof` and `case`."""
-        keys = {"oneof": self.oneof, "case": self.case}
+        """The keys that say how the envelope holds payloads: `oneof`, `case`, or `case` and `payload`."""
+        keys = {"oneof": self.oneof, "case": self.case, "payload": self.payload}
         return {name: value for name, value in keys.items() if value is not None}
+
+    @property
+    def has_many(self) -> bool:
+        """Whether each message of the protos is a payload case, not only those that the envelope contains."""
+        return self.payload is not None
 
 
 @dataclass(frozen=True, slots=True)

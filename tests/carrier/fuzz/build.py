@@ -11,6 +11,7 @@ Takes clang with its sanitizers. The folder is made; `corpus` in it grows while 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import random
 from collections.abc import Iterator
@@ -18,9 +19,9 @@ from pathlib import Path
 
 from router.carrier.build import sources
 from router.compiler.lowering.arrays import Arrays
-from router.declared import WireSchema
+from router.declared import WireName, WireSchema
 from router.image.wire_schema import write_schema
-from tests.carrier.datagrams import Maker
+from tests.carrier.datagrams import maker_for
 from tests.carrier.decisions import SCHEMAS, TESTS, table
 from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 
@@ -36,15 +37,17 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     declarations: list[str] = []
-    kinds: list[int] = []
+    kinds: list[str] = []
     noise = random.Random(1)
     for index, schema in enumerate(SCHEMAS):
         made = table(schema, folder)
         memory = Arrays()
         lowered = write_schema(made.envelope, made.inbound, memory)
         declarations += _arrays(index, lowered)
-        kinds.append(lowered.case_by)
-        maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
+        names = f"names_{index}" if lowered.name_count else "NULL"
+        numbers = lowered.case_by, names, lowered.name_count, lowered.name_field, lowered.payload_field
+        kinds.append(", ".join(map(str, numbers)))
+        maker = maker_for(made.envelope, noise)
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
         if schema == "rover":
             seeds += [bytes.fromhex(each["hex"]) for each in json.loads(GOLDEN.read_text())]
@@ -53,7 +56,7 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
             (corpus / f"{schema}-{number}-sent").write_bytes(b"!" + seed)  # for handle_fuzz
     declarations.append(f"enum {{ SCHEMA_COUNT = {len(SCHEMAS)} }};")
     schemas = ", ".join(
-        f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}, {by}}}" for index, by in enumerate(kinds)
+        f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}, {rest}}}" for index, rest in enumerate(kinds)
     )
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")
@@ -74,6 +77,13 @@ def _arrays(index: int, lowered: WireSchema) -> Iterator[str]:
         f"{{fields_{index}_{number}, {each.count}, {each.accepts_zero}}}" for number, each in enumerate(all_types)
     )
     yield f"static const struct wire_type types_{index}[] = {{{types}}};"
+    if names := lowered.names[: lowered.name_count]:
+        texts = (f'{{(const uint8_t *)"{_text(name)}", {name.size}, {name.type}, 0}}' for name in names)
+        yield f"static const struct wire_name names_{index}[] = {{{', '.join(texts)}}};"
+
+
+def _text(name: WireName) -> str:
+    return ctypes.string_at(name.text, name.size).decode()
 
 
 def main() -> None:
