@@ -158,9 +158,10 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
     targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for index, topic in enumerate(route.topics):
-        if any(are_same(topic, other) for other in route.topics[:index]):
-            message = f"topic '{topic.topic.value}' is listed twice"
-            lookup.report(topic.topic.span, Code.BAD_VALUE, message, "name it once")
+        name = topic.topic.value
+        if other := next((other for other in route.topics[:index] if other.topic.value == name), None):
+            hint = "name it once" if are_same(topic, other) else "give each mapping a topic of its own"
+            lookup.report(topic.topic.span, Code.BAD_VALUE, f"topic '{name}' is listed twice", hint)
         ros_type = lookup.ros_type(topic)
         if ros_type is not None and (published := _publish(lookup, route, case, topic, ros_type, names)):
             targets.append(published)
