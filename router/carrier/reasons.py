@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from router import datagrams
 from router.compiler.compiled_table import CompiledTable
+from router.declared import PLACE_ORDER
 from router.table.model.endpoints import Framing
 
 
@@ -29,6 +30,9 @@ def superseded(program: CompiledTable, listener: str, data: bytes) -> str:
 
 def where_refused(program: CompiledTable, route: str, topic: str | None, target: str, place: int) -> str:
     """Describe the place of the table (`enum place`) that refused a message of `topic` (None: a datagram)."""
+    if place == PLACE_ORDER:
+        (order,) = (each.order for each in program.table.routes if each.name == route)
+        return f"{order.span}: order" if order else ""
     (plan,) = (plan for plan in program.routes if (plan.route, plan.topic) == (route, topic))
     for state in program.states:
         if target == state.label:

@@ -141,6 +141,15 @@ class CheckedCollect:
 
 
 @dataclass(frozen=True, slots=True)
+class CheckedOrder:
+    """The number of `order`, which wraps around after `bits` bits."""
+
+    number: Node
+    bits: int
+    is_unsigned: bool
+
+
+@dataclass(frozen=True, slots=True)
 class CheckedRoute:
     """A route whose payload case exists. If there are errors, it is not compiled.
 
@@ -151,6 +160,7 @@ class CheckedRoute:
     case: PayloadCase
     targets: tuple[Target, ...] = ()
     subscriptions: tuple[CheckedSubscription, ...] = ()
+    order: CheckedOrder | None = None
     collect: CheckedCollect | None = None
     deadman: DeadmanPlan | None = None
 

@@ -246,6 +246,7 @@ DROP_REASONS: Mapping[str, str] = {
     "incomplete": "a frame that was not complete within its timeout, or for which there was no room",
     "superseded": "a command was held until a newer one of another route, which disarms its deadman, was sent",
     "missing_field": "a field is missing that the board's protos declare as `required`",
+    "out_of_order": "not newer, by the route's `order`, than what the same sender had sent before",
     "loop": "it came from this router: stays 0, because tables with loops are rejected",
 }
 """Reasons why a message was not delivered to a target, with their meaning."""

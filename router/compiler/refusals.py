@@ -40,6 +40,11 @@ _RANGES: Mapping[tuple[int, int], str] = {
 }
 
 
+def _order(refusal: NativeRefusal, _: bytes) -> str:
+    number, last, _unused = _integers(refusal)
+    return f"{number} again" if number == last else f"{number} after {last}"
+
+
 def _bounds(refusal: NativeRefusal, _: bytes) -> str:
     _value, low, high = _integers(refusal)
     return f"the low bound {low} is above the high bound {high}"
@@ -133,5 +138,6 @@ _WORDS: Mapping[Refused, Callable[[NativeRefusal, bytes], str]] = {
     Refused.ARRIVAL: partial(_age, "it arrived {} ago"),
     Refused.SENDING: partial(_age, _BY_SENDER),
     Refused.STAMP: partial(_age, _BY_STAMP),
+    Refused.ORDER: _order,
     Refused.WAITING: partial(_age, "{} old when it could be sent"),
 }

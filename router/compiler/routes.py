@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, Target
+from router.compiler.checked import CheckedCollect, CheckedOrder, CheckedRoute, CheckedSubscription, Target
 from router.compiler.deadmen import check_deadman
 from router.compiler.expressions import Scope
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.expressions.lists import as_value
-from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable
+from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable, constant_of
 from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -165,8 +165,9 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
         ros_type = lookup.ros_type(topic)
         if ros_type is not None and (published := _publish(lookup, route, case, topic, ros_type, names)):
             targets.append(published)
+    order = _order(lookup, case, route.order) if route.order else None
     collect = _collect(lookup, route, case, route.collect) if route.collect else None
-    return CheckedRoute(route, case, tuple(targets), collect=collect)
+    return CheckedRoute(route, case, tuple(targets), order=order, collect=collect)
 
 
 def _forward(
@@ -207,6 +208,25 @@ def _publish(
     mapping = build(topic.fields, ros_type, scope, topic.topic.span, whole, ros_type)
     lookup.findings += mapping.findings
     return Target(topic, type=ros_type, for_each=for_each, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
+
+
+def _order(lookup: Lookup, case: PayloadCase, expression: Expression) -> CheckedOrder | None:
+    wanted, hint = "'order' takes an integer that grows from message to message", "name one, such as envelope.seq"
+    number = lookup.value(expression, lookup.received(case), (IntKind,), wanted, hint)
+    if number is None or not isinstance(number.kind, IntKind):
+        return None
+    if constant_of(number) is not None:
+        message = "'order' has the same value for all messages, so only the first one would pass"
+        lookup.report(number.span, Code.BAD_VALUE, message, hint)
+        return None
+    low, high = number.kind.low, number.kind.high
+    bits = next((bits for bits in range(1, 64) if (low, high) in _of_bits(bits)), 64)
+    return CheckedOrder(number, bits, low >= 0)
+
+
+def _of_bits(bits: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the ranges of an unsigned and of a signed integer."""
+    return (0, (1 << bits) - 1), (-(1 << bits - 1), (1 << bits - 1) - 1)
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Node]:

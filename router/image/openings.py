@@ -89,6 +89,11 @@ class Openings:
         self._pacer(target.label)
         return self._open(symbol, "deferral_open", self._argument("pacer", target.label), of=(filled,))
 
+    def order(self, route: str) -> int:
+        """Open the numbers of the senders of a route, as long as they are numbers of the same kind."""
+        (declared,) = (each.order for each in self.program.table.routes if each.name == route)
+        return self._open(("order", route), "order_state_open", of=(str(declared), self.program.protos_sha256))
+
     def collector(self, plan: RoutePlan) -> int:
         """Open the collector that makes frames of the route's payload for its topics."""
         topics = tuple(_plain(target) for target in plan.targets if target.is_topic)

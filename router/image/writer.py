@@ -24,7 +24,7 @@ from router.image.names import Names
 from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
-from router.table.model.endpoints import Endpoint, EndpointKind, Framing
+from router.table.model.endpoints import STALE_AFTER, Endpoint, EndpointKind, Framing
 
 
 def write_image(program: CompiledTable, names: Names | None = None) -> Image:
@@ -200,9 +200,12 @@ class _Writer:
 
     def _choice(self, plan: RoutePlan | None, source: str | None) -> c.Choice:
         if plan is None:
-            return c.Choice(route=-1)
+            return c.Choice(route=c.NO_ROUTE)
         received = self.counters.index("messages_received", plan.route, source_label(source))
-        return c.Choice(route=self.numbers[plan.route], received=received)
+        number = self.numbers[plan.route]
+        return c.Choice(
+            route=c.ORDERED - number if plan.route in self.program.lowered.order else number, received=received
+        )
 
     # routes
 
@@ -217,11 +220,27 @@ class _Writer:
         )
         if topics:
             route.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
+        if plan.route in lowered.order:
+            route.order = ctypes.pointer(self.arrays.add(self._ordering(plan.route)))
         setters, witnesses = [*self.targets.setters(plan)], [*self._witnesses(plan)]
         route.setters, route.setter_count = self.arrays.array(c.Setter, setters), len(setters)
         route.witnesses, route.witness_count = self.arrays.array(c.Witness, witnesses), len(witnesses)
         route.is_watched = bool(setters or witnesses)
         return route
+
+    def _ordering(self, route: str) -> c.Ordering:
+        lowered, endpoints = self.program.lowered.order[route], self.program.table.endpoints.values()
+        routines = self.targets.routines(lowered.layout)
+        patience = [*(each.stale_after or STALE_AFTER for each in endpoints), STALE_AFTER]
+        return c.Ordering(
+            state=self.targets.openings.order(route),
+            number=routines.routine(lowered.routine),
+            layout=routines.layout(),
+            sources=self.targets.names_of_senders(),
+            patience=self.arrays.array(ctypes.c_int64, patience),
+            bits=lowered.bits,
+            is_unsigned=lowered.is_unsigned,
+        )
 
     def _witnesses(self, plan: RoutePlan) -> Iterator[c.Witness]:
         """Yield a witness for each deadman that awaits messages of this route, and each endpoint that sends them."""

@@ -74,6 +74,10 @@ REMEDIES: Mapping[str, str] = {
     ),
     "overloaded": "The gateway converts them more slowly than they arrive: exclude them, or lower their `rates`.",
     "missing_field": "A `required` field is missing: the sender must set it; the log names it.",
+    "out_of_order": (
+        "They arrive twice, or after newer ones: check the network for two paths. If it goes on, the sender does not "
+        "count up: see `order` of the route."
+    ),
     "incomplete": "Datagrams of their frames are lost or late: check the link, or raise `timeout` of `collect`.",
     "source_mismatch": "No route accepts them from that address: run `router tap --only rejected` to see the senders.",
     "unknown_case": "The sender's protos are newer than the router's: update them.",

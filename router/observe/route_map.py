@@ -110,6 +110,8 @@ def _case(route: Route) -> Node:
         words.append(f"dropped when older than {duration(route.ttl.value)}")
     if route.deadman is not None:
         words.append(f"deadman after {duration(route.deadman.timeout.value)}")
+    if route.order is not None:
+        words.append(f"in the order of {route.order.text}")
     if route.collect is not None:
         words.append("collected to frames")
     is_guarded = route.ttl is not None or route.deadman is not None

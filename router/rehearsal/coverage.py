@@ -137,6 +137,9 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
     name = route.route.name
     if ttl := route.route.ttl:
         yield ("stale", name), Item("rejection", ttl.span, f"no test has a message of {name} that is older than this")
+    if order := route.route.order:
+        gap = f"no test has a message of {name} that is out of order"
+        yield ("out_of_order", name), Item("rejection", order.span, gap)
     if collect := route.route.collect:
         gap = f"no test has a frame of {name} that stays incomplete"
         yield ("incomplete", name), Item("rejection", collect.span, gap)

@@ -52,6 +52,8 @@ if TYPE_CHECKING:  # which imports rclpy
     from router.ros.graph import Mistyped
 
 _WIDEST_CELL = 48
+_LONGEST_NUMBER = 64
+"""Bits of an integer."""
 
 # Routes
 
@@ -116,6 +118,9 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
     route, deadman = checked.route, checked.deadman
     if route.for_each is not None:
         yield f"  one datagram for each of {route.for_each.text}"
+    if route.order is not None and checked.order is not None:
+        wraps = f", which wraps around after {checked.order.bits} bits" if checked.order.bits < _LONGEST_NUMBER else ""
+        yield f"  in the order of {route.order.text}{wraps}; what is not newer is dropped as out_of_order"
     if route.collect is not None:
         collect = route.collect
         yield (

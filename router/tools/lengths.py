@@ -60,6 +60,8 @@ class _Needs:
         collect = checked.collect
         for node in (collect.by, collect.count, collect.order) if collect else ():
             self._of_node(node)
+        if checked.order is not None:
+            self._of_node(checked.order.number)
         for target in checked.targets:
             if target.when is not None:
                 self._of_node(target.when)

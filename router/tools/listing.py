@@ -13,7 +13,7 @@ from enum import Enum
 from router.compiler.checked import CheckedRoute, Target
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.expressions import tree
-from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements
+from router.compiler.lowering import Lowered, LoweredCollect, LoweredElements, LoweredFeed, LoweredOrder
 from router.compiler.lowering.layout import Layout, ReadOperation, WantedField
 from router.compiler.lowering.operations import Operation, Routine
 from router.declared import NONE, Compared, Op, ReadKind, Relation, Scalar, Sign
@@ -28,6 +28,8 @@ def listed_route(checked: CheckedRoute, program: CompiledTable) -> Iterator[str]
     """Yield all routines of a route."""
     lowered: Lowered = program.lowered
     name = checked.route.name
+    if checked.order is not None:
+        yield from _order(lowered.order[name], str(checked.order.number.span))
     for kind, routes in (("destination", lowered.to_destinations), ("topic", lowered.to_topics)):
         if name in routes:
             route = routes[name]
@@ -39,13 +41,17 @@ def listed_route(checked: CheckedRoute, program: CompiledTable) -> Iterator[str]
     for topic, feeds in lowered.from_ros.items():
         for feed in feeds:
             if feed.route == name:
-                yield ""
-                yield f"  from topic {topic}"
-                yield from _layout(feed.layout)
-                if feed.for_each is not None:
-                    yield from _for_each(feed.for_each, feed.layout, next(iter(feed.targets.values())))
-                for target in feed.targets.values():
-                    yield from _target("destination", target, feed.layout)
+                yield from _feed(topic, feed)
+
+
+def _feed(topic: str, feed: LoweredFeed) -> Iterator[str]:
+    yield ""
+    yield f"  from topic {topic}"
+    yield from _layout(feed.layout)
+    if feed.for_each is not None:
+        yield from _for_each(feed.for_each, feed.layout, next(iter(feed.targets.values())))
+    for target in feed.targets.values():
+        yield from _target("destination", target, feed.layout)
 
 
 # ---- what is read
@@ -121,6 +127,13 @@ def _for_each(elements: LoweredElements, layout: Layout, target: Target) -> Iter
     slots = [_slot(slot, layout) for slot in (elements.item, elements.index, elements.count) if slot != NONE]
     into = [f"section {elements.section}"] * (elements.section != NONE) + slots
     yield f"    each -> {', '.join(into)}" if into else "    each"
+
+
+def _order(order: LoweredOrder, place: str) -> Iterator[str]:
+    yield from _layout(order.layout)
+    yield ""
+    yield f"  order, {order.bits} bits"
+    yield from _listed(order.routine, [place] * len(order.routine), order.layout)
 
 
 def _collect(collect: LoweredCollect, layout: Layout, target: Target) -> Iterator[str]:

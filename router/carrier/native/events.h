@@ -85,7 +85,9 @@ enum refused {
     REFUSED_ARRIVAL, /* age since arrival */
     REFUSED_SENDING, /* age since sending, by the sender's clock */
     REFUSED_STAMP,   /* age by its own stamp */
-    REFUSED_WAITING  /* age at the time when it could be sent */
+    REFUSED_WAITING, /* age at the time when it could be sent */
+    /* Numbers of `order`: of the datagram, and the highest one of its sender; flags say which are unsigned. */
+    REFUSED_ORDER
 };
 
 struct refusal {
@@ -114,6 +116,7 @@ enum place {
     PLACE_FOR_EACH,
     PLACE_OPERATIONS /* plus the index of an operation */
 };
+#define PLACE_ORDER UINT32_MAX /* `order`, for all targets of a route */
 
 /* Why a target did not get a message: DROP_REASONS in compiler/metrics.py. */
 enum drop_reason {
@@ -128,8 +131,9 @@ enum drop_reason {
     DROP_TOO_LARGE,
     DROP_INCOMPLETE,
     DROP_SUPERSEDED,
-    DROP_MISSING_FIELD
+    DROP_MISSING_FIELD,
+    DROP_OUT_OF_ORDER
 };
-enum { DROP_REASONS = DROP_MISSING_FIELD + 1 };
+enum { DROP_REASONS = DROP_OUT_OF_ORDER + 1 };
 
 #endif

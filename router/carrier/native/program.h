@@ -11,6 +11,7 @@
 #include "deadman.h"
 #include "deliver.h"
 #include "envelope.h"
+#include "order.h"
 #include "state.h"
 
 /* A condition on the messages of a route from one sender. If it holds, the sender obeys the brake of this deadman. */
@@ -28,6 +29,7 @@ struct route {
     struct targets sends;     /* destinations, which the receive thread serves */
     struct targets publishes; /* topics, which the publish thread serves */
     const struct setter *setters;
+    const struct ordering *order; /* NULL without `order` */
     const struct witness *witnesses;
     uint32_t setter_count, witness_count;
     uint32_t last_message, duration; /* counters: boot clock; a histogram has HISTOGRAM_BOUNDS + 2 */
@@ -35,7 +37,9 @@ struct route {
     uint32_t reserved;
 };
 
-/* The route for messages of one sender with one payload case: its index, or -1. */
+/* The route for messages of one sender with one payload case. Of a route with `order`, the number is ORDERED minus its index,
+ * so that other routes cost nothing more. */
+enum { NO_ROUTE = -1, ORDERED = -2 };
 struct choice {
     int32_t route;
     uint32_t received; /* counter */

@@ -146,6 +146,59 @@ static void watch(struct routing *routing, const struct route *route, const stru
     show_to_deadmen(routing, route, received, &datagram);
 }
 
+/* ---- order ---- */
+
+/* A datagram is out of order, as `numbers` say; or if they are NULL, `order` has no value for this reason. */
+static void lose_of(struct routing *routing, const struct targets *to, int64_t now, int reason, const struct refusal *numbers) {
+    for (uint32_t index = 0; index < to->count; index++) {
+        struct lost_event lost = {.reason = (uint32_t)reason};
+        if (numbers) {
+            lost.refusal = *numbers;
+            lose_message(&routing->env, to, &to->targets[index], now, lost, "");
+        } else {
+            lost.generation = to->generation;
+            lost.place = PLACE_ORDER;
+            lose_refused(&routing->env, to, &to->targets[index], now, lost);
+        }
+    }
+}
+
+/* Lose it for all targets, and for the states that it would set. Returns false. */
+static bool lose_for_all(struct routing *routing, const struct route *route, const struct received *received, int reason,
+                         const struct refusal *numbers) {
+    lose_of(routing, &route->sends, received->now, reason, numbers);
+    lose_of(routing, &route->publishes, received->now, reason, numbers);
+    for (uint32_t index = 0; index < route->setter_count; index++)
+        if (route->setters[index].column == received->column)
+            lose_of(routing, &route->setters[index].to, received->now, reason, numbers);
+    return false;
+}
+
+static int number_of(struct routing *routing, const struct ordering *order, const struct received *received,
+                     struct value *number) {
+    struct datagram datagram = datagram_of(routing, received);
+    struct machine *machine = &routing->env.machine;
+    uint32_t at;
+    if (!read_datagram(machine, order->layout, order->sources, &datagram)) return DROP_MAPPING_ERROR;
+    return evaluate_value(machine, &order->number, number, &at);
+}
+
+/* Whether the datagram is newer than those of its sender that have passed. If it is not, or if its number does not exist, it is
+ * lost. */
+static bool is_in_order(struct routing *routing, const struct route *route, const struct received *received) {
+    const struct ordering *order = route->order;
+    struct value number;
+    uint64_t last;
+    int outcome = number_of(routing, order, received, &number);
+    if (outcome != EVALUATED) return lose_for_all(routing, route, received, outcome, NULL);
+    if (order_passes(order->state, received->address, received->port, number.bits, order->bits,
+                     order->patience[received->column], received->now, &last))
+        return true;
+    struct refusal numbers = {.kind = REFUSED_ORDER, .flags = order->is_unsigned ? FIRST_UNSIGNED | SECOND_UNSIGNED : 0,
+                              .values = {number.integer, (int64_t)last}};
+    return lose_for_all(routing, route, received, DROP_OUT_OF_ORDER, &numbers);
+}
+
 /* ---- routing ---- */
 
 /* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. */
@@ -173,6 +226,18 @@ static const struct payload_case *find_case(const struct protocol *protocol, uin
     return &protocol->cases[low]; /* envelope_read returns no other number */
 }
 
+/* Return the index of the route with `order` that the datagram passes; NO_ROUTE, or ORDERED if it is lost. It is not inlined, as
+ * other routes do not pay for it. */
+static __attribute__((noinline)) int32_t route_in_order(struct routing *routing, const struct choice *choice,
+                                                        struct received *received) {
+    if (choice->route == NO_ROUTE) return NO_ROUTE;
+    const struct route *chosen = &routing->program->routes[ORDERED - choice->route];
+    if (is_in_order(routing, chosen, received)) return ORDERED - choice->route;
+    received->route = chosen;
+    env_count(&routing->env, choice->received, 1);
+    return ORDERED;
+}
+
 /* Route a datagram. Return ROUTED, or the reason for rejecting it. */
 static int route(struct routing *routing, const struct payload_case *found, struct received *received) {
     const struct program *program = routing->program;
@@ -183,8 +248,10 @@ static int route(struct routing *routing, const struct payload_case *found, stru
         return UNHANDLED;
     }
     const struct choice *choice = &listener->choices[(uint32_t)found->row * listener->columns + received->column];
-    if (choice->route < 0) return SOURCE_MISMATCH;
-    const struct route *chosen = &program->routes[choice->route];
+    int32_t number = choice->route;
+    if (number < 0 && (number = route_in_order(routing, choice, received)) < 0)
+        return number == NO_ROUTE ? SOURCE_MISMATCH : ROUTED;
+    const struct route *chosen = &program->routes[number];
     received->route = chosen;
     env_count(&routing->env, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);

@@ -6,6 +6,7 @@ Each target is lowered once. A routine that is too large is a finding.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 from router.compiler.checked import CheckedRoute, CheckedState
 from router.compiler.expressions.tree import Node
@@ -15,6 +16,7 @@ from router.compiler.lowering.lowered import (
     LoweredCondition,
     LoweredElements,
     LoweredFeed,
+    LoweredOrder,
     LoweredRoute,
     LoweredState,
 )
@@ -29,11 +31,21 @@ __all__ = [
     "LoweredCondition",
     "LoweredElements",
     "LoweredFeed",
+    "LoweredOrder",
     "LoweredRoute",
     "LoweredState",
     "lower_condition",
     "lower_table",
 ]
+
+
+@contextmanager
+def _limits_in(findings: list[Diagnostic]) -> Iterator[None]:
+    """Add the finding about what is too large."""
+    try:
+        yield
+    except TooLargeError as error:
+        findings.append(error.diagnostic)
 
 
 _NO_STATES: Mapping[str, CheckedState] = {}
@@ -47,35 +59,33 @@ def lower_table(
     to_destinations: dict[str, LoweredRoute] = {}
     to_topics: dict[str, LoweredRoute] = {}
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}
+    order: dict[str, LoweredOrder] = {}
     obeyed: dict[str, LoweredCondition] = {}
     findings: list[Diagnostic] = []
     for checked in routes:
         filtered = [target for target in checked.targets if not target.topic and target.when is not None]
         published = [target for target in checked.targets if target.topic]
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
-            try:
+            with _limits_in(findings):
                 if targets:
                     source = Datagram(checked.case, envelope, names)
                     lowered[checked.route.name] = source.lowered(checked, targets)
-            except TooLargeError as error:
-                findings.append(error.diagnostic)
         for feed in checked.subscriptions:
             topic = feed.topic.topic.value
-            try:
+            with _limits_in(findings):
                 message = RosMessage(feed.type, topic, names)
                 from_ros[topic] = (*from_ros.get(topic, ()), message.lowered(checked, feed))
-            except TooLargeError as error:
-                findings.append(error.diagnostic)
-        try:
+        with _limits_in(findings):
+            if checked.order is not None:
+                order[checked.route.name] = Datagram(checked.case, envelope).ordered(checked.order)
+        with _limits_in(findings):
             if checked.obeyed is not None:
                 when, case = checked.obeyed.when, checked.obeyed.case
                 obeyed[checked.route.name] = lower_condition(when, case, envelope, is_bounded=True)
-        except TooLargeError as error:
-            findings.append(error.diagnostic)
     values = _lower_states(states, envelope, findings)
     for topic, of_state in _feeds(states, values):
         from_ros[topic] = (*from_ros.get(topic, ()), of_state)
-    return Lowered(to_destinations, to_topics, from_ros, obeyed, values), findings
+    return Lowered(to_destinations, to_topics, from_ros, order, obeyed, values), findings
 
 
 def _lower_states(
@@ -83,13 +93,11 @@ def _lower_states(
 ) -> Mapping[str, LoweredState]:
     lowered = {}
     for name, state in states.items():
-        try:
+        with _limits_in(findings):
             if state.feed is not None:
                 lowered[name] = RosMessage(state.feed.type, state.feed.topic.topic.value).state(state, state.feed)
             elif state.case is not None:
                 lowered[name] = Datagram(state.case, envelope).state(state)
-        except TooLargeError as error:
-            findings.append(error.diagnostic)
     return lowered
 
 

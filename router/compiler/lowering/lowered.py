@@ -91,6 +91,16 @@ class LoweredState:
 
 
 @dataclass(frozen=True, slots=True)
+class LoweredOrder:
+    """The number of `order`, the fields that it reads, and how it wraps around. Slots are those of a LoweredRoute."""
+
+    routine: Routine
+    layout: Layout
+    bits: int
+    is_unsigned: bool
+
+
+@dataclass(frozen=True, slots=True)
 class LoweredConstant:
     """The routine of a message that reads no other one, with the place of each operation."""
 
@@ -104,12 +114,13 @@ class Lowered:
     """All routines of a table.
 
     For datagrams, by route: `to_destinations` has the destinations with a condition, `to_topics` the topics. `from_ros`
-    is by topic, in the order of the table. `obeyed` has the conditions that show that a deadman's brake is obeyed, by
-    the deadman's route. `states` is by name.
+    is by topic, in the order of the table. `order` has the numbers of routes with `order`. `obeyed` has the conditions
+    that show that a deadman's brake is obeyed, by the deadman's route. `states` is by name.
     """
 
     to_destinations: Mapping[str, LoweredRoute]
     to_topics: Mapping[str, LoweredRoute]
     from_ros: Mapping[str, tuple[LoweredFeed, ...]]
+    order: Mapping[str, LoweredOrder]
     obeyed: Mapping[str, LoweredCondition]
     states: Mapping[str, LoweredState]

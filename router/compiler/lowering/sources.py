@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from google.protobuf.descriptor import Descriptor
 
-from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
+from router.compiler.checked import CheckedOrder, CheckedRoute, CheckedState, CheckedSubscription, Target
 from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.expressions.states import gate_of, states_in
@@ -20,6 +20,7 @@ from router.compiler.lowering.lowered import (
     LoweredConstant,
     LoweredElements,
     LoweredFeed,
+    LoweredOrder,
     LoweredRoute,
     LoweredState,
 )
@@ -38,8 +39,8 @@ from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
-"""Maximum operations per datagram of a destination's `when` or a state's value, about a millisecond of the receive
-thread."""
+"""Maximum operations per datagram of a destination's `when`, `order` or a state's value, about a millisecond of the
+receive thread."""
 
 _MOST_SLOTS = NONE
 
@@ -186,6 +187,12 @@ class Datagram(_Source):
         routine, span = self._number(state.value), state.value.span
         _require_fast(routine, span, "the value of a state")
         return LoweredState(routine, self.layout(span), f"{span}: state")
+
+    def ordered(self, order: CheckedOrder) -> LoweredOrder:
+        """Lower the number of `order`. Raises TooLargeError."""
+        routine, span = self._number(order.number), order.number.span
+        _require_fast(routine, span, "`order`")
+        return LoweredOrder(routine, self.layout(span), order.bits, order.is_unsigned)
 
     def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
         """Lower the ROS message of a topic, with the place of each operation."""

@@ -132,6 +132,7 @@ ROUTE: Sequence[Schema] = [
         "if": _has(source={"anyOf": [{"type": "object"}, {"type": "array", "contains": {"type": "object"}}]}),
         "then": {"allOf": [
             without("collect", "joins datagrams; it is not allowed if the source is a topic"),
+            without("order", "drops datagrams that were overtaken; it is not allowed if the source is a topic"),
             without("topics?", "publishes, but messages from a topic go to 'destinations'"),
         ]},
         "else": {"allOf": [

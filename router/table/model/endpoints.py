@@ -63,6 +63,9 @@ class Listener:
         return bound_to(self.address.value, self.interface)
 
 
+STALE_AFTER = 5_000_000_000
+"""The default of `stale_after`, in ns."""
+
 EPHEMERAL = "ephemeral"
 """The value of `send_from` for a source port chosen by the kernel, instead of a listener's port."""
 
@@ -108,7 +111,7 @@ class Endpoint:
 
     Example: 9000
     """
-    stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
+    stale_after: Annotated[int | None, PATIENCE] = STALE_AFTER
     """An endpoint that has been silent for longer counts as stale in diagnostics, on the status page, for 'router
     doctor' and in alerts. never: for an endpoint that only sends now and then.
 

@@ -154,8 +154,8 @@ class Route:
 
     `span` is the payload case in the table, or the first key of a route in a list. `name` is unique, for metrics and
     log: the payload case, or, for one of several routes of a case, a name such as `imu_info_from_ros`. Messages come
-    from `sources`, which are names of endpoints or only `any`, or from `source_topics`. `topics` (published) and
-    `collect` are for the former, `fields` and `for_each` for the latter. `ttl` is in ns. `no_ttl` is the reason why
+    from `sources`, which are names of endpoints or only `any`, or from `source_topics`. `topics` (published), `order`
+    and `collect` are for the former, `fields` and `for_each` for the latter. `ttl` is in ns. `no_ttl` is the reason why
     messages of any age may leave, `no_deadman` why a route with commands has no deadman.
     """
 
@@ -205,6 +205,13 @@ class Route:
     expressions see 'item', 'index' and 'count', and 'auto' copies from 'item'. Only for a topic as the source.
 
     Example: detections
+    """
+    order: Expression | None = None
+    """An expression that gives an integer which grows from message to message of a sender: only messages with a higher
+    one than all before them pass, others are dropped as out_of_order. It may wrap around. A sender whose messages all
+    have lower ones, because it has restarted, passes again after its 'stale_after'. Not for a topic as the source.
+
+    Example: envelope.seq
     """
     collect: Collect | None = None
     priority: Priority | None = None
