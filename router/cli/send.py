@@ -11,6 +11,9 @@ from router.cli.completion import cases, completes, endpoints, fields, places
 from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, until_interrupted, whole
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from router.datagrams import Wire
     from router.table.addresses import Address
     from router.table.model import RouteTable
     from router.tools.udp import Sent
@@ -29,7 +32,10 @@ def add_parser(subparsers: Subparsers) -> None:
     completes(parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info"), cases)
     completes(
         parser.add_argument(
-            "fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, counts[left]=4, state=NAME"
+            "fields",
+            nargs="*",
+            metavar="FIELD=VALUE",
+            help="x=1, bbox.x=3, points[1]=2, counts[left]=4, state=NAME; envelope.seq=5 is beside the payload",
         ),
         fields,
     )
@@ -51,11 +57,9 @@ def run(args: argparse.Namespace) -> int:
     from router.datagrams import framed
     from router.tools import udp
     from router.tools.udp import Sent, send
-    from router.values.reading import payload
 
     wire, table = load_wire(args, args.to)
-    case = wire.case(args.case)
-    exact = wire.encode(case, payload(case, args.fields))
+    exact = _envelope(wire, args.case, args.fields)
     data = framed(exact, args.trim, args.pad)
     to = udp.destination(args.to, table)
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
@@ -66,6 +70,19 @@ def run(args: argparse.Namespace) -> int:
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))
     return _advise(args, table, to, sent)
+
+
+def _envelope(wire: Wire, name: str, words: Sequence[str]) -> bytes:
+    """Return the envelope that the words describe: `envelope.x=1` is beside the payload, unless that has the field."""
+    from router.compiler.expressions.tree import ENVELOPE
+    from router.values.reading import assigned, payload
+
+    case, envelope = wire.case(name), wire.envelope
+    prefix = f"{ENVELOPE}."
+    is_beside = [word.startswith(prefix) and case.type.field(ENVELOPE) is None for word in words]
+    inside = [word for word, beside in zip(words, is_beside, strict=True) if not beside]
+    around = [word.removeprefix(prefix) for word, beside in zip(words, is_beside, strict=True) if beside]
+    return wire.encode(case, payload(case, inside), assigned(envelope.message_class(), envelope.beside, around))
 
 
 def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:

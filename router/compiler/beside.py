@@ -28,6 +28,7 @@ from router.table.model.expressions import Expression, FieldMap
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage, scalars
 from router.types.descriptors import container, message_of
 from router.types.model import Field, Float, Int, MessageType, Type
+from router.types.paths import type_at
 from router.types.wire import GROUP, GROUP_END, LEN, encoding_of, varint
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class _Set:
                 message = f"'{entry.path[0]}' is a payload, not a field beside it"
                 hint = f"the fields beside it are {', '.join(each.name for each in envelope.beside.fields) or 'none'}"
                 raise FindingError(entry.path_spans[0], Code.UNKNOWN_FIELD, message, hint)
-            written, target = entry.value, _type_at(envelope.beside, entry.path)
+            written, target = entry.value, type_at(envelope.beside, entry.path)
             value = self._value(written) if isinstance(written, Expression) else None
             if value is None or target is None or not isinstance(written, Expression):
                 constants.append(entry)
@@ -216,17 +217,6 @@ def _all_of(node: Node) -> Iterator[Node]:
     yield node
     for part in parts_of(node):
         yield from _all_of(part)
-
-
-def _type_at(message: MessageType, path: Path) -> Type | None:
-    """Return the type of a field by path; None if there is no such field."""
-    found: Type = message
-    for name in path:
-        member = found.field(name) if isinstance(found, MessageType) else None
-        if member is None:
-            return None
-        found = member.type
-    return found
 
 
 def _field_at(message: Descriptor, path: Path) -> FieldDescriptor:

@@ -15,8 +15,10 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from router.compiler.compiled_table import DeadmanPlan
+from router.compiler.expressions.tree import ENVELOPE, MESSAGE
 from router.datagrams import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address
@@ -27,6 +29,8 @@ from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
 from router.tools.udp import LOOPBACK, listener_address, open_udp
+from router.types.model import Int, MessageType
+from router.types.paths import type_at
 from router.types.protobuf import PayloadCase
 
 STRANGER = "(anybody)"
@@ -36,13 +40,33 @@ _SILENCE = re.compile(r"(?P<name>\w+):(?P<start>\d+(\.\d+)?)-(?P<end>\d+(\.\d+)?
 
 
 @dataclass(frozen=True, slots=True)
+class Numbered:
+    """The integer field that grows from message to message, by path: of the payload, or `is_beside` it."""
+
+    path: tuple[str, ...]
+    type: Int
+    is_beside: bool
+
+    def set(self, message: Any, number: int) -> None:
+        """Set the field of a payload or an envelope. The number wraps around to 0."""
+        *way, last = self.path
+        for name in way:
+            message = getattr(message, name)
+        setattr(message, last, number % (self.type.high + 1))
+
+
+@dataclass(frozen=True, slots=True)
 class Stream:
-    """One payload case that one endpoint sends, at `rate` Hz, the first after `offset` seconds."""
+    """One payload case that one endpoint sends, at `rate` Hz, the first after `offset` seconds.
+
+    `numbered` is what `order` of its route compares.
+    """
 
     endpoint: str
     case: PayloadCase
     rate: float
     offset: float
+    numbered: Numbered | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +132,29 @@ def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[
         if route.deadman is not None:
             rate = max(rate, FEEDS * 1e9 / route.deadman.timeout.value)
         rate *= speed
+        numbered = _numbered(route.order.text, case, wire) if route.order else None
         for source in route.sources:
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
                 hint = did_you_mean(sender, table.endpoints)
                 raise UsageError(f"{source.span}: there is no endpoint '{sender}'", hint)
             offset = random.Random(f"{seed}/{case.name}/{sender}").uniform(0, 1 / rate)
-            yield Stream(sender, case, rate, offset)
+            yield Stream(sender, case, rate, offset, numbered)
+
+
+_PATH = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
+
+
+def _numbered(order: str, case: PayloadCase, wire: Wire) -> Numbered | None:
+    """Return the first integer field that an expression reads."""
+    for match in _PATH.finditer(order):
+        first, *rest = steps = match[0].split(".")
+        beside = wire.envelope.beside if first == ENVELOPE else MessageType("")
+        payload = case.type if first == MESSAGE else MessageType("")
+        for kind, path in ((case.type, steps), (payload, rest), (beside, rest)):
+            if isinstance(found := type_at(kind, path), Int):
+                return Numbered(tuple(path), found, kind is beside)
+    return None
 
 
 DRAIN = 256
@@ -173,6 +213,7 @@ class Simulator:
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
         self._streams = tuple(streams(wire, table, seed, speed))
+        self._numbers = [0] * len(self._streams)
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed, lengths) for stream in self._streams]
@@ -274,9 +315,13 @@ class Simulator:
             return
         message = stream.case.message_class()
         self._models[index].fill(message, self._pose(stream.endpoint, at, epoch))
+        around = self._wire.envelope.message_class()
+        if stream.numbered is not None:
+            self._numbers[index] += 1
+            stream.numbered.set(around if stream.numbered.is_beside else message, self._numbers[index])
         try:
             to = self._destinations.get(stream.endpoint, self._router)
-            self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message), to)
+            self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message, around), to)
         except OSError:
             self.statistics.unsent += 1
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from router.errors import nearest
-from router.types.model import List, MessageType
+from router.types.model import List, MessageType, Type
 
 DEEPEST = 2
 """Maximum number of messages that a path omits before its first name."""
@@ -13,16 +13,20 @@ _ALIKE = 0.8
 """Similarity required to suggest a nested field for a misspelt name."""
 
 
+def type_at(message: MessageType, names: Sequence[str]) -> Type | None:
+    """Return the type of the field that `names` is a path to; None if there is no such field."""
+    found: Type = message
+    for name in names:
+        member = found.field(name) if isinstance(found, MessageType) else None
+        if member is None:
+            return None
+        found = member.type
+    return found
+
+
 def leads(message: MessageType, names: Sequence[str]) -> bool:
     """Return whether `names` is a path from the message to a field."""
-    *way, last = names
-    holder = message
-    for name in way:
-        member = holder.field(name)
-        if member is None or not isinstance(member.type, MessageType):
-            return False
-        holder = member.type
-    return holder.field(last) is not None
+    return type_at(message, names) is not None
 
 
 def ways(message: MessageType, names: Sequence[str], *, with_lists: bool = False) -> list[str]:

@@ -21,7 +21,12 @@ from router.types.protobuf import PayloadCase
 
 
 def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
-    """Return a payload with these `path=value` words applied in order. Raises UsageError.
+    """Return a payload with these words applied, as `assigned`."""
+    return assigned(case.message_class(), case.type, assignments)
+
+
+def assigned(message: Message, kind: MessageType, assignments: Sequence[str]) -> Message:
+    """Set fields of a message by `path=value` words, applied in order. Return it. Raises UsageError.
 
     A path is `x`, `bbox.x`, `points[1]`, `boxes[0].x` or `counts[left]`. The key of a map needs quotes, as in
     `counts["a.b"]`, unless it has only letters, digits, `_` and `-`. A list without an index is appended to; `bbox=`
@@ -32,8 +37,8 @@ def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
         match = _ASSIGNMENT.fullmatch(assignment)
         if match is None:
             raise UsageError(f"'{assignment}' is not an assignment", f"write {assignment or 'field'}=value")
-        _assign(members, case.type, match["path"], match["text"])
-    return filled(case.message_class(), members)
+        _assign(members, kind, match["path"], match["text"])
+    return filled(message, members)
 
 
 def filled(message: Message, members: Mapping[str, Any]) -> Message:

@@ -23,6 +23,9 @@ from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
 from router.tools.sim_view import SimView
 from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_obedience, parse_silence, streams
 from router.tools.udp import LOOPBACK, open_udp, reachable
+from tests.compiler.payloads import wire_of
+from tests.ports import free_port
+from tests.rehearsal.test_tables import TABLES
 
 FAST = 100.0
 
@@ -290,3 +293,46 @@ def test_silence_hints_at_nothing_while_only_ros_could_send(wire: Wire, table_pa
         view = SimView(wire, simulator.statistics)
         view.update(5.0)
         assert "router running" not in view.headline()
+
+
+ORDERED = """
+version: 1
+envelope: {protos: PROTOS, message: Frame, oneof: payload}
+listen: {rover: {address: "127.0.6.1:ROVER"}}
+endpoints:
+  board: {address: "127.0.6.30:BOARD", kind: tool}
+  base: {address: "127.0.6.10:BASE", kind: tool}
+routes:
+  speed: {source: board, destinations: base, order: envelope.header.seq % 256}
+  labelled: {source: board, destinations: base, order: message.envelope}
+  nested: {source: base, destinations: board, order: envelope.seq}
+  part: {source: base, destinations: board, order: round(value)}
+"""
+
+
+def test_what_order_compares_grows_from_message_to_message(tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    text = ORDERED.replace("PROTOS", str(TABLES / "beside"))
+    for name, host in (("ROVER", "127.0.6.1"), ("BOARD", "127.0.6.30"), ("BASE", "127.0.6.10")):
+        text = text.replace(name, str(free_port(host)))
+    path.write_text(text)
+    table, frames = read_table(path), Wire(wire_of(TABLES / "beside", "Frame")[1])
+    reads: dict[str, Callable[[Any], int]] = {
+        "speed": lambda frame: frame.header.seq,
+        "labelled": lambda frame: frame.labelled.envelope,
+        "nested": lambda frame: frame.nested.envelope.seq,
+    }
+    made = {stream.case.name: stream.numbered for stream in streams(frames, table, 1, FAST)}
+    assert made.pop("part") is None
+    for name, numbered in made.items():
+        assert numbered is not None
+        frame: Any = frames.envelope.message_class()
+        for number, expected in ((7, 7), (numbered.type.high + 1, 0)):
+            numbered.set(frame if numbered.is_beside else getattr(frame, name), number)
+            assert reads[name](frame) == expected
+    with played(frames, table) as (simulator, router):
+        simulate(simulator, lambda: all(sum(sent.values()) > 5 for sent in simulator.statistics.sent.values()))
+        found = [frames.envelope.message_class.FromString(router.recv(2000)) for _ in range(12)]
+    for name, read in reads.items():
+        counted = [read(frame) for frame in found if frame.WhichOneof("payload") == name]
+        assert counted == [*range(1, len(counted) + 1)]

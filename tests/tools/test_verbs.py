@@ -20,6 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from router.cli import main
 from router.table import read_table
+from tests.compiler.payloads import wire_of
+from tests.rehearsal.test_tables import TABLES
 from tests.tools.conftest import place
 
 EMPTY_PLAIN = bytes.fromhex("1200")
@@ -38,6 +40,17 @@ def test_send_says_what_it_sent_once_or_at_a_rate_trimmed_or_padded(
         assert main(["send", "plain", *words, "--to", to, "--protos", str(protos)]) == 0
         assert [receiver.recv(100).hex() for _ in sent] == sent
         assert capsys.readouterr().out.startswith(says)
+
+
+def test_send_fills_fields_beside_the_payload(receiver: socket.socket, capsys: pytest.CaptureFixture[str]) -> None:
+    table, frame = str(TABLES / "beside.yaml"), wire_of(TABLES / "beside", "Frame")[1].message_class
+    words = ["envelope.header.seq=5", "value=1.5", "envelope.mode=AUTONOMOUS"]
+    assert main(["send", "speed", *words, "--to", place(receiver), "--table", table]) == 0
+    assert receiver.recv(100) == frame(header={"seq": 5}, speed={"value": 1.5}, mode=1).SerializeToString()
+    assert main(["send", "labelled", "envelope=7", "--to", place(receiver), "--table", table]) == 0
+    assert receiver.recv(100) == frame(labelled={"envelope": 7}).SerializeToString()
+    assert main(["send", "speed", "envelope.speed=1", "--to", place(receiver), "--table", table]) == 2
+    assert "Frame has no field 'speed'" in capsys.readouterr().err
 
 
 def test_send_goes_from_endpoint_to_listener_and_says_when_the_router_will_not_take_it(
