@@ -183,6 +183,7 @@ LOSING = """\
   gps_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 1 Hz}], ttl: 300ms}
   manual_drive: {source: basestation, destinations: [driving_board], deadman: {none: for tests}}
   load_cell_info: {source: sensor_board, destinations: [recorder]}
+  pressure_info: {source: sensor_board, destinations: [basestation], order: round(pressure_kpa / temperature_c)}
   detected_object:
     source: basestation
     collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
@@ -230,6 +231,7 @@ DROPPED: Mapping[str, Callable[[Simulation], None]] = {
     "incomplete": from_basestation(enveloped(detected_object=PART)),
     "superseded": from_basestation(*[enveloped(manual_arm={})] * 2, enveloped(manual_drive={})),
     "missing_field": from_basestation(REQUIRING),
+    "out_of_order": from_board(*[enveloped(pressure_info={"pressure_kpa": kpa, "temperature_c": 1}) for kpa in (9, 7)]),
 }
 BRAKE, DRIVE = enveloped(manual_brake={"brake": True}), enveloped(manual_drive={"forward_backward": 5})
 REJECTED: Mapping[str, Callable[[Simulation], None]] = {
@@ -290,6 +292,16 @@ def test_every_loss_has_a_line_with_what_shows_it(reason: str, tmp_path: Path) -
     assert line["route"]
     assert line["target"]
     assert line.get("detail") or reason in {"queue_full", "superseded"}
+
+
+def test_a_loss_by_order_says_the_numbers_or_where_there_is_none(tmp_path: Path) -> None:
+    first, again, nowhere = [{"pressure_kpa": 9, "temperature_c": celsius} for celsius in (1, 1, 0)]
+    board = from_board(*[enveloped(pressure_info=values) for values in (first, again, nowhere)])
+    reports = told(program(tmp_path, LOSING), do=board)
+    assert [(each.reason, each.detail.partition(": ")[2] or each.detail) for each in reports] == [
+        ("out_of_order", "9 again"),
+        ("mapping_error", "order: division by zero"),
+    ]
 
 
 @pytest.mark.parametrize("reason", WITHOUT_A_STAGE)
