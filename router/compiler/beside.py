@@ -83,6 +83,9 @@ class _Set:
         """Return None after findings about constants. Raises FindingError for any other mistake."""
         lookup, envelope = self.lookup, self.lookup.envelope
         constants, changing, sources = [], dict[Path, Changing](), dict[str, Row]()
+        if not envelope.beside.fields:
+            message = f"{envelope.name} has no fields beside the payload"
+            raise FindingError(self.fields.span, Code.UNKNOWN_FIELD, message, "remove 'set'")
         for entry in self.fields.entries:
             if entry.path[0] in envelope.numbers:
                 message = f"'{entry.path[0]}' is a payload, not a field beside it"
