@@ -59,7 +59,7 @@ METRICS = (
         "superseded_members",
         "counter",
         ("listener",),
-        "Payloads that another one in the same datagram replaced: of a oneof, the last member counts.",
+        "Payloads that another one in the same datagram replaced, as in protobuf: the last one counts.",
     ),
     Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route accepted, by reason."),
     Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),
@@ -226,7 +226,7 @@ REJECT_REASONS: Mapping[str, str] = {
     "empty": "no bytes",
     "malformed": "not an envelope, or its payload is not of its type",
     "no_payload": "an envelope without a payload",
-    "unknown_case": "a field number that the envelope does not have",
+    "unknown_case": "a field number, or the name of a message, that the envelope does not have",
     "unhandled": "a payload case without a route",
     "ignored": "a payload case that the table ignores",
     "source_mismatch": "from an address that is not a source of the route, or on the wrong listener",
@@ -346,7 +346,7 @@ QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")
 """The policies that can make a publisher and a subscription incompatible."""
 
 UNKNOWN_CASE = "unknown"
-"""The `payload_case` label of a field number that the envelope does not have."""
+"""The `payload_case` label of a field number or a name that the envelope does not have."""
 
 
 class Series(NamedTuple):

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from router.compiler import check_table
+from router.datagrams import why_rejected
 
 REFEREE = 'syntax = "proto3";\nmessage Referee { uint32 sequence = 1; }\n'
 TABLE = """version: 1
@@ -86,3 +88,26 @@ def test_each_message_is_a_case_and_parts_of_others_need_no_route(
     assert lock["messages"].keys() == {"Referee", "Wrapped", "Part", "Whole", "Whole.Nested"}
     assert main(["validate", "table.yaml"]) == OK
     assert "no route for the payload case Whole\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"\x0a\x07referee", "'referee' (known: Referee)"),
+        (b"\x0a\x09x/Referee", "'x/Referee' (known: Referee)"),
+        (b"\x0a\x0da.b.c.Referee", "'a.b.c.Referee' (known: Referee)"),
+        (b"\x0a\x04Nope", "'Nope'"),
+        (b"\x0a\x07Referee\x12\x01\x07", "the payload is not a Referee"),
+        (b"\x08\x01", "field 1 is not text"),
+        (b"\x0a\x07Referee\x10\x01", "field 2 is not bytes"),
+        (b"\x12\x02\x08\x01", ""),
+        (b"", ""),
+    ],
+)
+def test_what_is_wrong_is_said(folder: Path, data: bytes, why: str) -> None:
+    (folder / "protos" / "b.proto").write_text(WRAPPED)
+    write_table(folder, NAMED, "Referee")
+    envelope = check_table(folder / "table.yaml", {}).envelope
+    assert envelope is not None
+    said, _, _ = why_rejected(envelope, data, len(data), repairs=True).partition("; ")  # guesses follow
+    assert said == why
