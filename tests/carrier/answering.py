@@ -70,7 +70,7 @@ def _lowered(asked: Question) -> LoweredRoute | LoweredFeed:
         lowered, findings = lower_table([CheckedRoute(route, asked.case, subscriptions=(feed,))])
     else:
         declared = topic if plan is not None else Destination(Located("endpoint", span), span)
-        target = Target(declared, type=asked.target, when=condition, plan=plan)
+        target = Target(declared, type=asked.target, when=condition, plan=plan, for_each=for_each)
         case, collect = envelope.cases["source"], _collect(asked) if asked.language.is_frame else None
         lowered, findings = lower_table([CheckedRoute(route, case, (target,), collect=collect)])
     if findings:

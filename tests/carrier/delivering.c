@@ -5,6 +5,10 @@
 #include "earliest.h"
 #include "route_ros.c"
 #undef deliver_to_all
+static bool note(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message);
+#define deliver note
+#include "each.c"
+#undef deliver
 
 enum { DELIVERED = -1, FILTERED_OUT = -2 };
 
@@ -61,7 +65,11 @@ static int32_t outcome_of(const struct delivering *of, const struct target *targ
     abort();
 }
 
-static bool note(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
+typedef bool serve(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message);
+
+/* Serve a message, and note what became of it, unless that was noted for each element. */
+static bool note_by(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message,
+                    serve *serve) {
     struct delivering *of = (struct delivering *)env;
     counter *counters = env->counters;
     int64_t before[2 + DROP_REASONS] = {counters[target->delivered], counters[target->filtered]};
@@ -69,7 +77,9 @@ static bool note(struct thread_env *env, const struct targets *to, const struct 
     struct { struct lost_event event; char text[256]; } lost = {0};
     env->reporter.left = 1;
     of->bytes.size = 0;
-    bool goes_on = deliver(env, to, target, message);
+    size_t noted_before = of->notes.size;
+    bool goes_on = serve(env, to, target, message);
+    if (of->notes.size != noted_before) return goes_on;
     ring_take(env->reporter.events, &lost, sizeof lost, 0);
     struct noted noted = {.target = (uint32_t)(target - to->targets), .outcome = outcome_of(of, target, before),
                           .place = lost.event.place, .length = (uint32_t)of->bytes.size};
@@ -81,9 +91,14 @@ static bool note(struct thread_env *env, const struct targets *to, const struct 
     return goes_on;
 }
 
+static bool note(struct thread_env *env, const struct targets *to, const struct target *target, struct message *message) {
+    return note_by(env, to, target, message, deliver);
+}
+
 bool note_all(struct thread_env *env, const struct targets *to, struct message *message) {
     for (uint32_t index = 0; index < to->count; index++)
-        if (!note(env, to, &to->targets[index], message)) return false;
+        if (!note_by(env, to, &to->targets[index], message, to->targets[index].for_each ? deliver_each : deliver))
+            return false;
     return true;
 }
 

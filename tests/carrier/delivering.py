@@ -22,7 +22,7 @@ from tests.carrier.building import MEMORY, sanitizing
 
 FILTERED = "filtered"
 _NOTED = Struct("@IIiIII")
-_OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _BYTES, _FIRST_DROP = range(6)
+_OF_ROUTE, _DELIVERED, _FILTERED, _COLLECTED, _SPLIT, _BYTES, _FIRST_DROP = range(7)
 _OF_TARGET = _FIRST_DROP + c.DROP_REASONS
 _LOSS = Struct("@6Ii3I2I3q")
 """`struct lost_event`."""
@@ -109,6 +109,9 @@ class Delivering:
             made.dropped[:] = [first + _FIRST_DROP + reason for reason in range(c.DROP_REASONS)]
             if target.message and not is_from_ros:
                 made.topic = ctypes.pointer(topic)
+            if target.elements is not None:
+                made.for_each = ctypes.pointer(self._arrays.add(write_for_each(target.elements, routines)))
+                made.split = first + _SPLIT
             targets.append(made)
         self._targets = c.Targets(
             targets=(c.Target * len(targets))(*targets),
@@ -188,7 +191,7 @@ class Delivering:
         """The nonzero counts of a target."""
         number = [each.label for each in self._lowered].index(label)
         of_target = self._counters[1 + number * _OF_TARGET :][:_OF_TARGET]
-        names = (None, "delivered", "filtered", "collected", None, *DROP_REASON_NAMES)
+        names = (None, "delivered", "filtered", "collected", "split", None, *DROP_REASON_NAMES)
         return {name: count for name, count in zip(names, of_target, strict=True) if name and count}
 
     def from_ros(self, data: bytes) -> list[Outcome]:

@@ -147,7 +147,7 @@ class Question:
 
 
 def question(noise: random.Random, language: Language) -> Question:
-    is_forwarded = not language.is_ros and not language.is_frame and noise.randrange(8) == 0
+    is_forwarded = not language.is_ros and not language.is_frame and not language.for_each and noise.randrange(8) == 0
     when = None
     if is_forwarded or noise.randrange(4) == 0:
         when = written(language.text(noise, "b", noise.choice((1, 2, 3))))
@@ -245,6 +245,8 @@ def oracle(asked: Question) -> Callable[[Sent, View], list[Verdict]]:
             elements = meaning.give(context)
         except Refused as refused:
             return [Verdict(None, refused.reasons)]
+        if not elements and not asked.language.is_ros:
+            return [Verdict(None, frozenset([FILTERED]))]
         count = (len(elements), Whole(0, (1 << 32) - 1))
         return [
             _verdict(asked, message, replace(context, names={

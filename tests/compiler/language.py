@@ -168,6 +168,7 @@ ITEMS: Mapping[str, Mapping[str, Sequence[str]]] = {
     "[i32, u64]": {"i": ("item",)}, "i16x3 if flag else few": {"i": ("item",)},
 }  # fmt: skip
 """Lists for `for_each`, and the fields of their elements in expressions."""
+_ITEMS_OF_ROS = ("f64x3", "i16x3 if flag else few")
 
 FRAME: Mapping[str, Sequence[str]] = {
     "i": ("items[0].i32", "items[1].u64", "items[2].inner.value", "items[0].inners[1].value", "items[1].grade", "count",
@@ -301,10 +302,12 @@ class Language:
 
 
 def some_language(noise: random.Random, *, is_wild: bool = False) -> Language:
-    """A language over datagrams, frames, ROS messages, or the elements of a list in a ROS message."""
+    """A language over datagrams, frames, ROS messages, or the elements of a list in a datagram or ROS message."""
     is_ros, has_more = noise.randrange(2) == 1, noise.randrange(3) == 0
-    for_each = noise.choice([*ITEMS]) if is_ros and has_more else ""
-    return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS), is_frame=has_more and not is_ros)
+    is_frame = has_more and not is_ros and noise.randrange(2) == 1
+    lists = [each for each in ITEMS if is_ros or each not in _ITEMS_OF_ROS]
+    for_each = noise.choice(lists) if has_more and not is_frame else ""
+    return Language(is_ros, is_wild, for_each, noise.randrange(ORDERS), is_frame=is_frame)
 
 
 def _bracketed(number: int) -> str:
