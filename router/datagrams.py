@@ -151,7 +151,7 @@ def _why_no_payload(envelope: Envelope, outer: Message, datagram: bytes) -> tupl
 
 
 def _unparsed(case: str) -> str:
-    return f"the payload is not a {case}"
+    return f"the payload is not a valid {case}"
 
 
 def _why_malformed(envelope: Envelope, datagram: bytes, what: str = "") -> str:

@@ -97,7 +97,7 @@ def test_each_message_is_a_case_and_parts_of_others_need_no_route(
         (b"\x0a\x09x/Referee", "'x/Referee' (known: Referee)"),
         (b"\x0a\x0da.b.c.Referee", "'a.b.c.Referee' (known: Referee)"),
         (b"\x0a\x04Nope", "'Nope'"),
-        (b"\x0a\x07Referee\x12\x01\x07", "the payload is not a Referee"),
+        (b"\x0a\x07Referee\x12\x01\x07", "the payload is not a valid Referee"),
         (b"\x08\x01", "field 1 is not text"),
         (b"\x0a\x07Referee\x10\x01", "field 2 is not bytes"),
         (b"\x12\x02\x08\x01", ""),
