@@ -79,9 +79,11 @@ class Reloader:
         return result
 
     def reopen(self) -> None:
-        """Reopen the listeners whose address or network interface has appeared, if any."""
+        """Reopen the listeners whose address or network interface has appeared, if any, and join groups again."""
         with self._one_at_a_time:
             program = self._runtime.program
+            for each in self._runtime.sockets.listeners.values() if self._is_open else ():
+                each.join_groups()
             replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
             if not self._is_open or program is None or not replaceable:
                 return

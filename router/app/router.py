@@ -234,7 +234,9 @@ class Router:
     def _watch(self) -> None:
         """Watch the network interfaces of listeners, and the table's files if the table says so."""
         listeners = self.listeners.values()
-        may_change = any(each.interface or each.is_waiting or each.address.host != "0.0.0.0" for each in listeners)
+        may_change = any(
+            each.interface or each.has_groups or each.is_waiting or each.address.host != "0.0.0.0" for each in listeners
+        )
         if self._interfaces is None and may_change:
             self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:
@@ -264,6 +266,9 @@ class Router:
                 ((server,), n) for server, n in list(self._runtime.gateways.refused.items())
             ],
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
+            "groups_not_joined": lambda: [
+                ((name,), len(each.missing_groups)) for name, each in self.listeners.items() if each.has_groups
+            ],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
             "topic_subscribers": self._runtime.topics.subscribers,

@@ -53,6 +53,12 @@ METRICS = (
     Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
     Metric("received_bytes", "counter", ("listener",), "Bytes of the datagrams taken from the listener's socket."),
     Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
+    Metric(
+        "groups_not_joined",
+        "number",
+        ("listener",),
+        "Multicast groups that it has not joined: their network interface or a route to them is missing.",
+    ),
     Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is missing."),
     Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were restored or removed."),
     Metric(

@@ -38,6 +38,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
                 hint += f", or give {second.owner if first.interface else first.owner} an 'interface'"
             hint += ": only one of them can receive there"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
+    yield from _group_findings(table)
     yield from _listener_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
@@ -99,6 +100,16 @@ def _overlap(one: _LocalAddress, other: _LocalAddress) -> bool:
         return False
     hosts = one.address.value.host, other.address.value.host
     return one.address.value.port == other.address.value.port and (hosts[0] == hosts[1] or WILDCARD in hosts)
+
+
+def _group_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for listeners that would never receive the datagrams to their groups."""
+    for listener in table.listeners.values():
+        if listener.groups and listener.address.value.host != WILDCARD:
+            address = listener.address.value
+            message = f"listener '{listener.name}' is at {address}, where the kernel delivers nothing to a group"
+            hint = f"write 0.0.0.0:{address.port}; 'interface' selects the network"
+            yield Diagnostic(listener.address.span, Code.BAD_VALUE, message, hint)
 
 
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:

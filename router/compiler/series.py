@@ -75,6 +75,8 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
             ),
             listener,
         )
+        if table.listeners[listener].groups:
+            _open(counters, ("groups_not_joined",), listener)
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
     _open_each(counters, "unhandled", last=(*envelope.numbers, UNKNOWN_CASE))
     for metric in ENDPOINT_METRICS:

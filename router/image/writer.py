@@ -54,7 +54,8 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
             for (topic, feeds), routes in zip(program.lowered.from_ros.items(), ros.values(), strict=True)
         ],
         listeners=[
-            (each.name, tuple(each.address.value), each.interface, each.receive_buffer) for each in program.listeners
+            (each.name, tuple(each.address.value), each.interface, each.receive_buffer, each.group_hosts)
+            for each in program.listeners
         ],
         senders=[
             (each.name, tuple(each.address.value), each.kind is EndpointKind.BOARD, sent_from(program.table, each))

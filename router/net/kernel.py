@@ -227,16 +227,25 @@ def port_holder(protocol: str, port: int) -> str:
     return _described(_process(protocol, port))
 
 
+def port_holders(protocol: str, port: int) -> list[str]:
+    """Return all processes that /proc shows to have a port: `python (pid 4711)`. `protocol` is udp or tcp."""
+    return [_described(process) for process in _processes(protocol, port)]
+
+
 def _described(process: Path | None) -> str:
     return f"{_name(process)} (pid {process.name})" if process is not None else "another process"
 
 
 def _process(protocol: str, port: int) -> Path | None:
+    return next(_processes(protocol, port), None)
+
+
+def _processes(protocol: str, port: int) -> Iterator[Path]:
     from pathlib import Path
 
     wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
     processes = Path("/proc").glob("[0-9]*")
-    return next((process for process in processes if not wanted.isdisjoint(_open_files(process))), None)
+    return (process for process in processes if not wanted.isdisjoint(_open_files(process)))
 
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Collection, Iterable, Iterator, MutableMapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
@@ -27,6 +27,8 @@ from router.net.kernel import (
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Protocol, TypeVar
+
+    from router.net.multicast import Groups
 
     class Bound(Protocol):
         """A ListeningSocket, or a listener that has one."""
@@ -121,11 +123,18 @@ class ListeningSocket:
     While its address or interface is missing, for example that of a tunnel that comes up later, it `is_waiting`: the
     socket is not bound and receives nothing, and `address` is the wanted one. Any other failure raises OSError.
     `has_senders`: senders bound to its port are open. `receive_buffer` is the granted size in bytes. `wanted` are the
-    address and the interface that it was opened for.
+    address and the interface that it was opened for. With `groups`, it shares the port with other programs;
+    `missing_groups` are those that are not joined now, each with the reason.
     """
 
     def __init__(
-        self, address: tuple[str, int], interface: str | None, receive_buffer: int, *, has_senders: bool = False
+        self,
+        address: tuple[str, int],
+        interface: str | None,
+        receive_buffer: int,
+        groups: Collection[str] = (),
+        *,
+        has_senders: bool = False,
     ) -> None:
         handed_over = inherited().take(address, interface)
         self.is_inherited = handed_over is not None
@@ -134,15 +143,18 @@ class ListeningSocket:
         self.address = address
         self.wanted = address, interface
         self.is_waiting = False
+        self._groups: Groups | None = None
+        self._is_shared = False
         try:
             if handed_over is not None:
                 discard_unstamped(handed_over)
             send_arrivals(self.socket)
-            # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment: with either, a second router
-            # would steal the port unnoticed.
-            with self.shared() if has_senders else nullcontext():
+            # Never SO_REUSEPORT, and SO_REUSEADDR only beside senders and for a moment, or with groups: with either, a
+            # second router would steal the port unnoticed.
+            with self.shared() if has_senders or groups else nullcontext():
                 if handed_over is None:
                     self._try_to_bind()
+            self.follow_groups(groups)
             report_sending_errors(self.socket)
             self.request_receive_buffer(receive_buffer)
         except OSError:
@@ -165,6 +177,26 @@ class ListeningSocket:
         if not self.is_inherited or self.receive_buffer < size:
             self.receive_buffer = ask_for_receive_buffer(self.socket, size)
 
+    def follow_groups(self, wanted: Collection[str]) -> None:
+        """Join the `wanted` groups, also again on an interface that has come back, and leave the others.
+
+        Raises OSError. Use it in one thread at a time.
+        """
+        if self._groups is None:
+            if not wanted:
+                return
+            from router.net.multicast import Groups  # few tables need it
+
+            self._groups = Groups(self.socket, self.interface)
+        self._is_shared = bool(wanted)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, self._is_shared)
+        if not self.is_waiting:
+            self._groups.follow(wanted)
+
+    @property
+    def missing_groups(self) -> Mapping[str, str]:
+        return self._groups.missing if self._groups is not None else {}
+
     def close(self) -> None:
         self.socket.close()
 
@@ -183,7 +215,7 @@ class ListeningSocket:
         try:
             yield
         finally:
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, self._is_shared)
 
     def end_input(self) -> None:
         """Accept nothing new. Queued datagrams can still be received; after them, receiving returns the peer None.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from router.errors import StartError
 from router.log import logger
@@ -56,7 +56,11 @@ class Listener:
         self._settings = settings
         try:
             self.opened = opened or ListeningSocket(
-                settings.address.value, settings.interface, settings.receive_buffer, has_senders=has_senders
+                settings.address.value,
+                settings.interface,
+                settings.receive_buffer,
+                settings.group_hosts,
+                has_senders=has_senders,
             )
         except OSError as error:
             raise _refused(settings, error) from error
@@ -65,6 +69,7 @@ class Listener:
         self.is_inherited = self.opened.is_inherited
         self.is_waiting = self.opened.is_waiting
         self._check_receive_buffer()
+        self._log_groups({})
         self._drops_at_close = 0
 
     @property
@@ -99,6 +104,35 @@ class Listener:
         if has_changed:
             self.opened.request_receive_buffer(settings.receive_buffer)
             self._check_receive_buffer()
+        self.join_groups()
+
+    def join_groups(self) -> None:
+        """Join the groups of its settings, also again on an interface that has come back. Use one thread at a time."""
+        before = {**self.missing_groups}
+        self.opened.follow_groups(self._settings.group_hosts)
+        self._log_groups(before)
+
+    @property
+    def missing_groups(self) -> Mapping[str, str]:
+        """The groups that are not joined now, each with the reason. A waiting listener has none."""
+        return self.opened.missing_groups
+
+    @property
+    def has_groups(self) -> bool:
+        return bool(self._settings.groups)
+
+    def _log_groups(self, before: Mapping[str, str]) -> None:
+        for group, why in self.missing_groups.items():
+            if before.get(group) != why:
+                logger.warning(
+                    "multicast group not joined: the listener does not receive it; the router tries each second",
+                    listener=self.name,
+                    group=group,
+                    why=why,
+                    remedy="bring the network up, add a route to the group, or give the listener an `interface`",
+                )
+        if joined := [group for group in before if group not in self.missing_groups]:
+            logger.info("multicast groups joined", listener=self.name, groups=joined)
 
     def kernel_drops(self) -> int:
         """Return the number of datagrams that the kernel has dropped since the socket was opened. Thread-safe."""

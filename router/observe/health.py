@@ -102,6 +102,7 @@ _STALE_FROM_ROS = (
 """ROS messages have the time when they were sent; the age of a datagram counts from its arrival."""
 
 _MORE: Mapping[Kind, str] = {
+    Kind.GROUP_NOT_JOINED: ", {:.0f} of them missing",
     Kind.QOS_INCOMPATIBLE: ", {:.0f} of them",
     Kind.GATEWAY_CLIENT_SLOW: " by {:.0f} s",
     Kind.GATEWAY_TOPIC_NOT_SERVED: ", {:.0f} of them",

@@ -54,6 +54,12 @@ class Kind(enum.Enum):
         "Bring up the network of {address}, or correct `listen`; `ip -br address` shows what exists.",
         "listener_waiting",
     )
+    GROUP_NOT_JOINED = (
+        Level.CRITICAL,
+        "{listener} has not joined all of its multicast groups",
+        "Bring its network up, add a route to the group, or give {listener} an `interface`; `router doctor` names it.",
+        "groups_not_joined",
+    )
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",

@@ -61,9 +61,9 @@ class HeadStart:
         self._close_sockets()
 
     def _open_sockets(self, image: Image) -> None:
-        for name, address, interface, receive_buffer in image.listeners:
+        for name, address, interface, receive_buffer, groups in image.listeners:
             try:
-                self.listening[name] = ListeningSocket(address, interface, receive_buffer)
+                self.listening[name] = ListeningSocket(address, interface, receive_buffer, groups)
             except OSError as error:
                 raise OSError(error.errno, f"listener '{name}' cannot be opened: {error.strerror}") from error
         every = [*self.listening.values()]

@@ -115,6 +115,7 @@ ADDRESSES: tuple[Path, ...] = (
     ("http", "address"),
     ("foxglove", "address"),
     ("listen", "*", "address"),
+    ("listen", "*", "groups", "*"),
     ("endpoints", "*", "address"),
     ("gateways", "*", "receive"),
     *(("gateways", "*", "transport", name) for name in ("udp", "tcp", "websocket")),
@@ -149,6 +150,9 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     is_locator = "zenoh" in path[3:]
     locator = LOCATOR.fullmatch(node.text) if is_locator else None
     name, key = ".".join(map(str, path[:-1])), path[-1]
+    if key == "groups":
+        yield from _group_outside(f"'{key}' of {name}", node, networks)
+        return
     try:
         address = parse_address(locator["address"] if locator else node.text)
     except BadAddressError:
@@ -165,6 +169,12 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     nearest = f"{_moved(host, networks.members[0])}:{address.port}"
     example = f"{locator['protocol']}{nearest}{locator['rest']}" if locator else nearest
     yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, _remedy(path, example, networks, is_extended))
+
+
+def _group_outside(what: str, node: ScalarNode, networks: Networks) -> Iterator[Diagnostic]:
+    if not any(ipaddress.IPv4Address(node.text) in network for network in networks.members):
+        hint = f"remove it, or add {node.text}/32 to `networks`: then anybody who sends to the group is received"
+        yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, f"{what} has {node.text}, outside {networks}", hint)
 
 
 def _moved(host: ipaddress.IPv4Address, network: ipaddress.IPv4Network) -> ipaddress.IPv4Address:

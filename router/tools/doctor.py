@@ -36,6 +36,7 @@ from router.tools.doctor_checks import (
     warning,
     ways,
 )
+from router.tools.multicast_checks import groups
 from router.tools.running_router import Health, health, url_of
 
 
@@ -53,6 +54,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     if running is None and all(result.grade is Grade.FINE for result in results):
         yield from ros_peers(program)
     yield from listeners(program)
+    yield from groups(program)
     yield from ports(program, running=running is not None)
     yield from ros_ports(program, variables)
     yield from receive_buffers(program)
@@ -80,7 +82,8 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     if program is not None:
         if not any(result.about == "ROS" for result in problems):
             yield from ros_peers(program)
-        yield from (result for result in listeners(program) if result.grade is not Grade.FINE)
+        networks = chain(listeners(program), groups(program))
+        yield from (result for result in networks if result.grade is not Grade.FINE)
         yield from ways(program, warning)
 
 

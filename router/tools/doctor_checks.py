@@ -222,14 +222,17 @@ def ports(program: CompiledTable, *, running: bool, with_listeners: bool = True)
     if running:
         yield fine("ports", "the running router has them")
         return
-    wanted: list[tuple[str, Address, str | None, str]] = []
-    wanted += [("tcp", address.value, None, what) for address, what in _pages(program) if address is not None]
-    gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
+    wanted: list[tuple[str, Address, str | None, str, bool]] = []
+    wanted += [("tcp", address.value, None, what, True) for address, what in _pages(program) if address is not None]
+    gateways = [(protocol, address, None, what, protocol == "tcp") for protocol, address, what in _gateways(program)]
     wanted += gateways
     there = [listener for listener in program.listeners if _absence(listener) is None] if with_listeners else []
-    wanted += [("udp", listener.address.value, listener.interface, f"listener '{listener.name}'") for listener in there]
+    wanted += [
+        ("udp", listener.address.value, listener.interface, f"listener '{listener.name}'", bool(listener.groups))
+        for listener in there
+    ]
     refused = [finding for port in wanted for finding in _port(*port, waits=port in gateways)]
-    free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
+    free = ", ".join(bound_to(address, interface) for _, address, interface, *_ in wanted)
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
 
@@ -279,11 +282,16 @@ def _gateways(program: CompiledTable) -> Iterator[tuple[str, Address, str]]:
                     yield "tcp", parse_address(match["address"]), what
 
 
-def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[CheckResult]:
-    """Check that an address can be bound. `waits`: the router waits for an address that no interface has yet."""
+def _port(
+    protocol: str, address: Address, interface: str | None, what: str, is_shared: bool, waits: bool
+) -> Iterator[CheckResult]:
+    """Check that an address can be bound.
+
+    `is_shared`: with SO_REUSEADDR, as by servers and listeners with groups. `waits`: the router waits for an address
+    that no interface has yet.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
-        if protocol == "tcp":
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, is_shared)
         try:
             if interface is not None:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())

@@ -106,9 +106,17 @@ def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: s
     assert outside(tmp_path, LOCAL.replace(address, moved).replace("networks: [127.0.0.0/8]\n", "")) == []
 
 
+def test_a_group_has_to_lie_in_them(tmp_path: Path) -> None:
+    text = LOCAL.replace("127.0.0.1:5000}", "127.0.0.1:5000, groups: [224.5.23.2]}")
+    [found] = outside(tmp_path, text)
+    assert found.startswith("'groups' of listen.rover has 224.5.23.2, outside the networks of")
+    assert "add 224.5.23.2/32 to `networks`" in found
+    assert outside(tmp_path, text.replace("/8]", "/8, 224.5.23.0/24]")) == []
+
+
 def test_no_address_of_the_schema_is_left_out() -> None:
-    found = {path for path, definition in references(table_schema()) if definition == "address"}
-    assert found == {pattern for pattern in ADDRESSES if "zenoh" not in pattern}
+    found = {path for path, definition in references(table_schema()) if definition in ("address", "group")}
+    assert found == {pattern[: 3 if "groups" in pattern else None] for pattern in ADDRESSES if "zenoh" not in pattern}
 
 
 def test_the_networks_of_an_extended_table_hold_until_others_replace_them(tmp_path: Path) -> None:

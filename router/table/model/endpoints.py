@@ -6,7 +6,7 @@ from typing import Annotated
 
 from router.errors import Located, SourceSpan
 from router.table.addresses import LOCAL, REMOTE, Address
-from router.table.keys import Named, Range, Shape
+from router.table.keys import Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.units import DATA_RATE, PATIENCE, SIZE
 
@@ -57,10 +57,20 @@ class Listener:
     Example: wlan0
     Example: wg0
     """
+    groups: Annotated[tuple[Located[str], ...], Shape("group"), Listed(least=1, unique=True)] = ()
+    """Also receive datagrams to these multicast groups, on `interface`; without it, on the interface to which the
+    computer's routes send the group. The address must be at 0.0.0.0; its port is shared with other programs.
+
+    Example: [224.5.23.2]
+    """
 
     @property
     def bound_to(self) -> str:
         return bound_to(self.address.value, self.interface)
+
+    @property
+    def group_hosts(self) -> tuple[str, ...]:
+        return tuple(group.value for group in self.groups)
 
 
 STALE_AFTER = 5_000_000_000

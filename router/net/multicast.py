@@ -1,0 +1,117 @@
+"""Multicast groups that listening sockets join, by the index of a network interface.
+
+A head start uses this, so it imports only small modules.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from collections.abc import Collection
+
+IP_MULTICAST_ALL = 49
+
+# Of <linux/netlink.h> and <linux/rtnetlink.h>.
+_RTM_NEWROUTE, _RTM_GETROUTE = 24, 26
+_NLM_F_REQUEST = 1
+_RTA_DST, _RTA_OIF = 1, 4
+_HEADER = struct.Struct("=IHHII")
+_ROUTE = struct.Struct("=8BI")
+_ATTRIBUTE = struct.Struct("=HH")
+_INDEX = struct.Struct("=I")
+
+NO_INTERFACE = "there is no such network interface"
+NO_ROUTE = "no route leads to the group, and its listener names no interface"
+
+
+def route_index(host: str) -> int | None:
+    """Return the index of the network interface to which the routes of this computer send an IPv4 address, or None."""
+    attribute = _ATTRIBUTE.pack(_ATTRIBUTE.size + 4, _RTA_DST) + socket.inet_aton(host)
+    body = _ROUTE.pack(socket.AF_INET, 32, 0, 0, 0, 0, 0, 0, 0) + attribute
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asking:
+        asking.send(_HEADER.pack(_HEADER.size + len(body), _RTM_GETROUTE, _NLM_F_REQUEST, 1, 0) + body)
+        answer = asking.recv(4096)
+    length, kind, *_ = _HEADER.unpack_from(answer)
+    if kind != _RTM_NEWROUTE:
+        return None
+    at = _HEADER.size + _ROUTE.size
+    while at < length:
+        size, what = _ATTRIBUTE.unpack_from(answer, at)
+        if what == _RTA_OIF:
+            return int(_INDEX.unpack_from(answer, at + _ATTRIBUTE.size)[0])
+        at += (size + 3) & ~3
+    return None
+
+
+def interface_index(name: str) -> int | None:
+    """Return the index of a network interface, or None. One that was removed and has come back has another index."""
+    try:
+        return socket.if_nametoindex(name)
+    except OSError:
+        return None
+
+
+def _is_interface(index: int) -> bool:
+    try:
+        socket.if_indextoname(index)
+    except OSError:
+        return False
+    return True
+
+
+def wanted_index(group: str, interface: str | None) -> int | None:
+    """Return the interface on which to join a group or send to it: the named one, else that of the route to it."""
+    return route_index(group) if interface is None else interface_index(interface)
+
+
+class Groups:
+    """The groups of one socket, which receives datagrams to these groups only. Use it in one thread at a time.
+
+    `missing` are the groups that are not joined now, each with the reason. Other threads may read it.
+    """
+
+    def __init__(self, opened: socket.socket, interface: str | None) -> None:
+        self._socket = opened
+        self._interface = interface
+        self._joined: dict[str, int] = {}
+        self.missing: dict[str, str] = {}
+
+    def follow(self, wanted: Collection[str]) -> None:
+        """Join the `wanted` groups that are not joined on their interfaces, and leave the others. Raises OSError."""
+        # Otherwise the socket also gets the groups that other programs have joined.
+        self._socket.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0 if wanted else 1)
+        for group in self._joined.keys() - wanted:
+            self._leave(group)
+        missing = {group: self._join(group) for group in wanted}
+        self.missing = {group: why for group, why in missing.items() if why}
+
+    def _join(self, group: str) -> str:
+        """Join a group on its present interface. Return why that is impossible, or ""."""
+        joined, index = self._joined.get(group), wanted_index(group, self._interface)
+        if index is None:
+            if joined is not None and _is_interface(joined):
+                return ""  # only the route is gone
+            if joined is not None:
+                self._leave(group)
+            return NO_INTERFACE if self._interface is not None else NO_ROUTE
+        if joined == index:
+            return ""
+        if joined is not None:
+            self._leave(group)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, _membership(group, index))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # the socket was inherited with it
+                return error.strerror or str(error)
+        self._joined[group] = index
+        return ""
+
+    def _leave(self, group: str) -> None:
+        membership = _membership(group, self._joined.pop(group))
+        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, membership)
+
+
+def _membership(group: str, index: int) -> bytes:
+    """Return a struct ip_mreqn."""
+    return socket.inet_aton(group) + bytes(4) + struct.pack("@i", index)
