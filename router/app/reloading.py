@@ -79,13 +79,14 @@ class Reloader:
         return result
 
     def reopen(self) -> None:
-        """Reopen the listeners whose address or network interface has appeared, if any, and join groups again."""
+        """Reopen listeners, join groups, and send to groups, where addresses and network interfaces have appeared."""
         with self._one_at_a_time:
             program = self._runtime.program
-            for each in self._runtime.sockets.listeners.values() if self._is_open else ():
-                each.join_groups()
+            if not self._is_open or program is None:
+                return
+            self._runtime.sockets.follow_interfaces()
             replaceable = [each for each in self._runtime.sockets.listeners.values() if each.is_replaceable()]
-            if not self._is_open or program is None or not replaceable:
+            if not replaceable:
                 return
             try:
                 self._runtime.take_over(program)

@@ -233,11 +233,7 @@ class Router:
 
     def _watch(self) -> None:
         """Watch the network interfaces of listeners, and the table's files if the table says so."""
-        listeners = self.listeners.values()
-        may_change = any(
-            each.interface or each.has_groups or each.is_waiting or each.address.host != "0.0.0.0" for each in listeners
-        )
-        if self._interfaces is None and may_change:
+        if self._interfaces is None and self._runtime.sockets.may_lose_interfaces:
             self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:
             self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)

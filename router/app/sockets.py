@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 from router.app.change import Change
 from router.carrier.sender import NativeSender
-from router.compiler.network import LOOPBACK, WILDCARD, sent_from
+from router.compiler.network import LOOPBACK, WILDCARD, destination, sent_from
 from router.errors import ConfigurationError
 from router.log import logger
 from router.net.sockets import ListeningSocket, placed
-from router.net.udp import Listener, absence, open_sending, usual_source, why_unreachable
+from router.net.udp import Listener, absence, open_sending, usual_source, why_no_way
 from router.startup_image.head_start import HeadStart
 from router.table.addresses import BadAddressError
 from router.table.model import endpoints
@@ -47,7 +47,7 @@ def _check_reachable(endpoint: endpoints.Endpoint, is_new: bool) -> None:
     """Log why nothing can be sent to an endpoint now. Raises ConfigurationError for a broadcast address."""
     address = endpoint.address.value
     try:
-        found = why_unreachable(address)
+        found = why_no_way(endpoint)
     except BadAddressError as error:
         if is_new:
             raise ConfigurationError(f"{endpoint.address.span}: {error.what}", error.hint) from error
@@ -70,11 +70,6 @@ def _check_source(endpoint: endpoints.Endpoint, sender: NativeSender) -> None:
         route=usual,
         remedy="use `send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
     )
-
-
-def _destination(endpoint: endpoints.Endpoint) -> object:
-    """Return the settings of an endpoint that its sender depends on."""
-    return tuple(endpoint.address.value), endpoint.kind is endpoints.EndpointKind.BOARD
 
 
 class KernelDrops:
@@ -130,12 +125,13 @@ class Sockets:
                 name = sent_from(program.table, to)
                 source = placed(listeners.get(name) if name is not None else None, listeners.values())
                 beside = source.opened if source is not None else None
-                destination, sender = self._senders.get(to.name, (None, None))
-                is_new = sender is None or destination != _destination(to)
+                wanted, (known, sender) = destination(program.table, to), self._senders.get(to.name, (None, None))
+                is_new = sender is None or known != wanted
                 _check_reachable(to, is_new)
                 if sender is None or is_new:
                     opened = open_sending(to, source, every)
-                    sender = NativeSender(self._library, to.address.value, opened, beside)
+                    address, _, cast = wanted
+                    sender = NativeSender(self._library, address, opened, beside, cast)
                     opening.callback(sender.close)
                 elif not sender.is_placed(beside, every):
                     opened = open_sending(to, source, every)
@@ -188,12 +184,29 @@ class Sockets:
             each.follow(plans[name])
         self.listeners, self._of_head_start = sockets.listeners, []
         self._bound = {plans[name].bound_to: each for name, each in sockets.listeners.items()}
-        self._senders = {to.name: (_destination(to), sockets.senders[to.name]) for to in change.program.senders}
+        table = change.program.table
+        self._senders = {to.name: (destination(table, to), sockets.senders[to.name]) for to in change.program.senders}
 
     def finish(self, change: Change) -> None:
         """Close the sockets that only the earlier program used."""
         if change.sockets is not None:
             change.sockets.unused.close()
+
+    def follow_interfaces(self) -> None:
+        """Join and send to groups on the interfaces that have appeared. Not thread-safe."""
+        for listener in self.listeners.values():
+            listener.join_groups()
+        for _, sender in self._senders.values():
+            if sender.has_interface:
+                sender.follow_interface()
+
+    @property
+    def may_lose_interfaces(self) -> bool:
+        """Whether listeners or senders depend on addresses or interfaces that may disappear and return."""
+        return any(sender.has_interface for _, sender in self._senders.values()) or any(
+            each.interface or each.has_groups or each.is_waiting or each.address.host != WILDCARD
+            for each in self.listeners.values()
+        )
 
     def close_listeners(self) -> None:
         for listener in self.listeners.values():

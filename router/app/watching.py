@@ -72,9 +72,8 @@ class InterfaceWatcher:
     """Checks once a second whether `listeners` have their addresses and network interfaces.
 
     After a tunnel or an adapter was removed and has come back, a socket stays bound to the old interface and receives
-    nothing; a waiting socket was never bound. `reopen` is called in the watcher's thread until both receive, and each
-    second for multicast groups, which must be joined again. A socket whose address is gone receives again when the
-    address comes back. `close` does not wait.
+    nothing; a waiting socket was never bound. `reopen` is called each time in the watcher's thread, and makes them
+    receive. A socket whose address is gone receives again when the address comes back. `close` does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
@@ -94,8 +93,7 @@ class InterfaceWatcher:
                 if each not in reported and not each.is_waiting:
                     what = "the network interface" if each.has_lost_interface() else "the address"
                     logger.error(f"{what} is gone: the listener receives nothing", listener=each.name)
-            if any(each.has_groups or each.is_waiting or each.has_lost_interface() for each in self._listeners()):
-                self._reopen()
+            self._reopen()
             if back := [each.name for each in reported if each in self._listeners() and each not in lost]:
                 logger.info("these listeners now receive: their networks are up", listeners=back)
             reported = lost

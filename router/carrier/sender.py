@@ -13,7 +13,8 @@ class NativeSender:
     """Sends to one address, through a socket that `net.sockets.open_sending` has opened for `source`. Owns the socket.
 
     `address` is that of its `struct sender`. `leaves_from` is the address that the socket is bound to, 0.0.0.0 if the
-    kernel chooses one for each datagram; `is_bound`: it sends from the port of its listener.
+    kernel chooses one for each datagram; `is_bound`: it sends from the port of its listener. `cast` is as in
+    `compiler.network`: until the network interface of a group is there, sending fails with EBADF.
     """
 
     def __init__(
@@ -22,13 +23,15 @@ class NativeSender:
         destination: tuple[str, int],
         opened: socket.socket,
         source: ListeningSocket | None = None,
+        cast: tuple[str | None, int, bool] | str | None = None,
     ) -> None:
         """Raises MemoryError."""
         self._library = library
+        self._cast = cast
         self._place(source, opened)
         host, port = destination
         number = int.from_bytes(socket.inet_aton(host), "big")
-        self.address = int(library.sender_open(opened.fileno(), self._listening, number, port) or 0)
+        self.address = int(library.sender_open(self._aimed(), self._listening, number, port) or 0)
         if not self.address:
             opened.close()
             raise MemoryError("a sender of the carrier cannot be opened")
@@ -37,8 +40,27 @@ class NativeSender:
         """Send through `opened` from now on. Return the earlier socket; close it when no thread uses it."""
         left = self.socket
         self._place(source, opened)
-        self._library.sender_move(self.address, opened.fileno(), self._listening)
+        self._library.sender_move(self.address, self._aimed(), self._listening)
         return left
+
+    @property
+    def has_interface(self) -> bool:
+        """Whether it sends to a group through an interface with a name, which may disappear and return."""
+        return isinstance(self._cast, tuple) and self._cast[0] is not None
+
+    def follow_interface(self) -> None:
+        """Send to the group through the interface that has the name now."""
+        self._library.sender_move(self.address, self._aimed(), self._listening)
+
+    def _aimed(self) -> int:
+        """Prepare the socket for its cast, and return its descriptor, or -1 while the interface is missing."""
+        if isinstance(self._cast, tuple):
+            from router.net.multicast import aim  # few tables need it
+
+            return self.socket.fileno() if aim(self.socket, *self._cast) else -1
+        if self._cast is not None:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        return self.socket.fileno()
 
     def _place(self, source: ListeningSocket | None, opened: socket.socket) -> None:
         self.socket, self.source = opened, source

@@ -139,7 +139,7 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     from router.tools.tap import listen
 
     wire, table = load_wire(args, place)
-    with udp.open_udp(udp.listening(place, table), place) as receiver:
+    with udp.open_udp(udp.listening(place, table), place, udp.endpoint_of(place, table)) as receiver:
         host, port = receiver.getsockname()
         say(f"listening on {host}:{port}; press Ctrl-C to stop")
         with until_interrupted():

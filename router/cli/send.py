@@ -67,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     sent = Sent()
     # Without --count, Ctrl-C stops sending; the summary is printed all the same.
     with udp.open_udp(origin, "--from") as sender, until_interrupted():
+        if (endpoint := udp.endpoint_of(args.to, table)) is not None:
+            udp.aim(sender, endpoint)
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))
     return _advise(args, table, to, sent)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TypeAlias
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
 from router.table.addresses import Address
@@ -16,6 +17,9 @@ from router.table.model.routes import ANY
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
+
+Cast: TypeAlias = tuple[str | None, int, bool] | str | None
+"""How a sender reaches several machines: interface, hops and loop of a group, "broadcast", or None for one machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
             hint += ": only one of them can receive there"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _group_findings(table)
+    yield from _several_machines(table)
     yield from _listener_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
@@ -112,6 +117,23 @@ def _group_findings(table: RouteTable) -> Iterator[Diagnostic]:
             yield Diagnostic(listener.address.span, Code.BAD_VALUE, message, hint)
 
 
+def _several_machines(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for groups and broadcast addresses that are used as one machine."""
+    sources = {source.value: source.span for route in table.routes for source in route.sources}
+    for endpoint in table.endpoints.values():
+        if endpoint.is_one_machine:
+            continue
+        key = "group" if endpoint.group is not None else "broadcast"
+        if endpoint.kind is EndpointKind.BOARD:
+            message = f"'{endpoint.name}' is a board, but '{key}' sends to any number of machines"
+            hint = "give each board an endpoint with its 'address': commands and deadmen are for known boards"
+            yield Diagnostic(endpoint.address.span, Code.BAD_VALUE, message, hint)
+        if endpoint.name in sources:
+            message = f"'{endpoint.name}' cannot be a source: no datagram comes from the address of its '{key}'"
+            hint = "name an endpoint with the 'address' of the sender"
+            yield Diagnostic(sources[endpoint.name], Code.BAD_VALUE, message, hint)
+
+
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for unknown listeners of endpoints, and for listeners that accept no sending endpoint."""
     for endpoint in table.endpoints.values():
@@ -161,7 +183,9 @@ def loop_finding(
         message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
     for listener in table.listeners.values():
-        if _reaches(endpoint.address.value, listener.address.value):
+        own = listener.address.value
+        returns = endpoint.broadcast is not None and own == (WILDCARD, endpoint.broadcast.value.port)
+        if returns or _reaches(endpoint.address.value, own):
             message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
             hint = "remove it, or correct its address: datagrams would return to the router in an endless loop"
             return Diagnostic(span, Code.FORWARDING_LOOP, message, hint)
@@ -185,6 +209,20 @@ def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
         return endpoint.listener.value
     places = {listener.address.value for listener in table.listeners.values()}
     return next(iter(table.listeners)) if len(places) == 1 else None
+
+
+def destination(table: RouteTable, endpoint: Endpoint) -> tuple[tuple[str, int], bool, Cast]:
+    """Return what the sender of an endpoint depends on: its address, whether it is a board, and its cast.
+
+    The cast of a multicast group is the network interface, the number of hops, and whether the datagrams also reach
+    sockets of this computer: unless a listener of the table would receive them.
+    """
+    host, port = endpoint.address.value
+    cast: Cast = "broadcast" if endpoint.broadcast is not None else None
+    if endpoint.group is not None:
+        own = (each for each in table.listeners.values() if each.address.value.port == port)
+        cast = endpoint.interface, endpoint.hops or 1, all(host not in each.group_hosts for each in own)
+    return (host, port), endpoint.kind is EndpointKind.BOARD, cast
 
 
 def recognisers(

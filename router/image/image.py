@@ -20,11 +20,11 @@ class Image:
     the arrays of `ros_topics` (topic, offset, number of routes, whether one is urgent) are structures in it.
 
     To open, by name: `listeners` (name, address, interface, receive buffer, multicast groups), `senders` (name,
-    address, whether it is a board, listener to send from), and `topics` (name, whether late subscribers get messages).
-    `openings` lists the objects to open, in this order: (symbol, function, arguments, what else identifies the object,
-    whether it belongs to the clients of gateways). An argument that is a tuple of one number is a symbol. `timers` are
-    adopted: (symbol, whether it is for a topic, offset of its targets, offset of the target). `deadmen` and
-    `client_deadmen` are (name, names that it sends to, commands that it watches).
+    address, whether it is a board, its cast as in `compiler.network`, listener to send from), and `topics` (name,
+    whether late subscribers get messages). `openings` lists the objects to open, in this order: (symbol, function,
+    arguments, what else identifies the object, whether it belongs to the clients of gateways). An argument that is a
+    tuple of one number is a symbol. `timers` are adopted: (symbol, whether it is for a topic, offset of its targets,
+    offset of the target). `deadmen` and `client_deadmen` are (name, names that it sends to, commands that it watches).
 
     `names` are the names with a number, `series` the counters with an index, below `counters`. `mirror_lost` is the
     counter of what observers miss; None if nothing is observed from the start.
@@ -39,7 +39,7 @@ class Image:
     listener_array: int
     ros_topics: list[tuple[str, int, int, bool]]
     listeners: list[tuple[str, tuple[str, int], str | None, int, tuple[str, ...]]]
-    senders: list[tuple[str, tuple[str, int], bool, str | None]]
+    senders: list[tuple[str, tuple[str, int], bool, tuple[str | None, int, bool] | str | None, str | None]]
     topics: list[tuple[str, bool]]
     openings: list[tuple[Symbol, str, tuple[Any, ...], tuple[Any, ...], bool]]
     timers: list[tuple[int, bool, int | None, int | None]]

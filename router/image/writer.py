@@ -14,7 +14,7 @@ from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan,
 from router.compiler.lowering import LoweredFeed
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
-from router.compiler.network import recognisers, sent_from
+from router.compiler.network import destination, recognisers, sent_from
 from router.compiler.refusals import REJECTIONS
 from router.declared import NONE
 from router.image.boards import write_boards
@@ -24,7 +24,7 @@ from router.image.names import Names
 from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
-from router.table.model.endpoints import STALE_AFTER, Endpoint, EndpointKind, Framing
+from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing
 
 
 def write_image(program: CompiledTable, names: Names | None = None) -> Image:
@@ -58,8 +58,7 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
             for each in program.listeners
         ],
         senders=[
-            (each.name, tuple(each.address.value), each.kind is EndpointKind.BOARD, sent_from(program.table, each))
-            for each in program.senders
+            (each.name, *destination(program.table, each), sent_from(program.table, each)) for each in program.senders
         ],
         topics=[(each.label, each.qos.serves_late_joiners) for each in program.publishers],
         openings=[*openings.listed.values()],

@@ -1,4 +1,4 @@
-"""Multicast groups that listening sockets join, by the index of a network interface.
+"""Multicast: groups that listening sockets join, and how sockets send to groups, by the index of a network interface.
 
 A head start uses this, so it imports only small modules.
 """
@@ -10,7 +10,7 @@ import socket
 import struct
 from collections.abc import Collection
 
-IP_MULTICAST_ALL = 49
+from router.net.kernel import IP_MULTICAST_ALL
 
 # Of <linux/netlink.h> and <linux/rtnetlink.h>.
 _RTM_NEWROUTE, _RTM_GETROUTE = 24, 26
@@ -22,7 +22,7 @@ _ATTRIBUTE = struct.Struct("=HH")
 _INDEX = struct.Struct("=I")
 
 NO_INTERFACE = "there is no such network interface"
-NO_ROUTE = "no route leads to the group, and its listener names no interface"
+NO_ROUTE = "no route leads to the group, and no interface is named for it"
 
 
 def route_index(host: str) -> int | None:
@@ -63,6 +63,23 @@ def _is_interface(index: int) -> bool:
 def wanted_index(group: str, interface: str | None) -> int | None:
     """Return the interface on which to join a group or send to it: the named one, else that of the route to it."""
     return route_index(group) if interface is None else interface_index(interface)
+
+
+def aim(opened: socket.socket, interface: str | None, hops: int, is_looped: bool) -> bool:
+    """Have a socket send to groups through a network interface; without one, through that of the route to the group.
+
+    Return whether the interface is there; the socket sends elsewhere until it has been there once. After it was
+    removed and has come back, do this again. `hops` is the number of networks that a datagram may pass. `is_looped`:
+    also to sockets of this computer.
+    """
+    opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hops)
+    opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, is_looped)
+    if interface is None:
+        return True
+    if (index := interface_index(interface)) is None:
+        return False
+    opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _membership("0.0.0.0", index))
+    return True
 
 
 class Groups:

@@ -14,6 +14,7 @@ from functools import cache
 
 from router.net.kernel import (
     IP_FREEBIND,
+    IP_MULTICAST_ALL,
     allow_fragments,
     ask_for_receive_buffer,
     bound_interface,
@@ -299,6 +300,7 @@ def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]
     opened = _open_free(socket.AF_INET6)
     try:
         opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        opened.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)  # otherwise it gets a copy of what groups get
         opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         host, port = address_beside(source, listening)

@@ -10,6 +10,7 @@ from router.errors import StartError
 from router.log import logger
 from router.net import sockets
 from router.net.kernel import bound_interface, drops, why_not_bound
+from router.net.multicast import interface_index
 from router.net.sockets import ABSENT, ListeningSocket
 from router.table.addresses import Address, not_one_machine
 from router.table.model import endpoints
@@ -186,6 +187,8 @@ def why_not_sent(error: OSError, address: Address) -> str:
             return f"a firewall of this computer forbids sending to {address}: `nft list ruleset`"
         case errno.ENETUNREACH | errno.EHOSTUNREACH:
             return f"no route leads to {address.host}, or it does not answer: {ask}"
+        case errno.EBADF | errno.ENODEV:
+            return f"the network interface through which {address.host} is reached is missing: `ip link`"
         case errno.EINVAL:
             return f"the routes of this computer discard datagrams to {address.host}: {ask}"
     return error.strerror or str(error)
@@ -210,6 +213,14 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
             why = error.strerror.lower() if error.strerror else str(error)
             return f"the kernel refuses it: {why}", f"run `ip route get {address.host}` to see which route refuses it"
     return None
+
+
+def why_no_way(endpoint: endpoints.Endpoint) -> tuple[str, str] | None:
+    """Return why nothing can be sent to an endpoint now, with a remedy, as `why_unreachable` for its address."""
+    address = endpoint.address.value
+    if endpoint.interface is not None:
+        return ABSENT[errno.ENODEV] if interface_index(endpoint.interface) is None else None
+    return None if endpoint.broadcast is not None and _is_broadcast(address) else why_unreachable(address)
 
 
 def usual_source(address: Address) -> str | None:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class HeadStart:
     """A running image, which was compiled from `inputs`.
 
-    `listening` are its listeners by name. `senders` are by endpoint, each with what it depends on: the address, and
-    whether it is a board. `sent` has the endpoints that deadmen have sent to, by route.
+    `listening` are its listeners by name. `senders` are by endpoint, each with what it depends on: the address,
+    whether it is a board, and its cast. `sent` has the endpoints that deadmen have sent to, by route.
     """
 
     def __init__(self, image: Image, inputs: Plain) -> None:
@@ -67,13 +67,14 @@ class HeadStart:
             except OSError as error:
                 raise OSError(error.errno, f"listener '{name}' cannot be opened: {error.strerror}") from error
         every = [*self.listening.values()]
-        for name, address, is_board, listener in image.senders:
+        for name, address, is_board, cast, listener in image.senders:
             source = placed(self.listening.get(listener) if listener is not None else None, every)
             try:
                 opened = open_sending(source, every, is_board=is_board)
             except OSError:  # as in `net.udp.open_sending`, which logs it later
                 source, opened = None, open_sending(None, is_board=is_board)
-            self.senders[name] = (address, is_board), NativeSender(library(), address, opened, source)
+            sender = NativeSender(library(), address, opened, source, cast)
+            self.senders[name] = (address, is_board, cast), sender
 
     def _close_sockets(self) -> None:
         for _, sender in self.senders.values():

@@ -29,7 +29,7 @@ class Address(NamedTuple):
 
 
 _EXAMPLE = "write an IPv4 address and a port, such as 192.168.0.30:8"
-_NO_MULTICAST = "write the address of one machine: broadcast and multicast are not supported"
+_NO_MULTICAST = "write the address of one machine; for several, an endpoint has `group` or `broadcast` instead"
 _NO_LOCAL_MULTICAST = "write an address of this machine, or 0.0.0.0 for all of them"
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
@@ -82,7 +82,27 @@ def parse_local(text: str) -> Address:
     return address
 
 
+def parse_group(text: str) -> Address:
+    """Parse a multicast group with its port. Raises BadAddressError."""
+    address = parse_address(text)
+    if not 224 <= _first(address) <= 239:
+        what = f"{address.host} is not a multicast group"
+        raise BadAddressError(what, "write a group from 224.0.0.0 to 239.255.255.255, and a port")
+    return address
+
+
+def parse_broadcast(text: str) -> Address:
+    """Parse an address that may be a broadcast address, which depends on the networks. Raises BadAddressError."""
+    address = parse_address(text)
+    if _first(address) == 0 or (_first(address) >= 224 and address.host != "255.255.255.255"):
+        what = f"{address.host} is not the broadcast address of a network"
+        raise BadAddressError(what, "write it as `ip address` shows it after 'brd', and a port")
+    return address
+
+
 REMOTE = Quantity("address", parse_remote, str)
+GROUP = Quantity("address", parse_group, str)
+BROADCAST = Quantity("address", parse_broadcast, str)
 LOCAL = Quantity("address", parse_local, str)
 
 
@@ -116,7 +136,7 @@ ADDRESSES: tuple[Path, ...] = (
     ("foxglove", "address"),
     ("listen", "*", "address"),
     ("listen", "*", "groups", "*"),
-    ("endpoints", "*", "address"),
+    *(("endpoints", "*", name) for name in ("address", "group", "broadcast")),
     ("gateways", "*", "receive"),
     *(("gateways", "*", "transport", name) for name in ("udp", "tcp", "websocket")),
     *(("gateways", "*", "transport", "zenoh", name, "*") for name in ("connect", "listen")),
@@ -150,7 +170,7 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     is_locator = "zenoh" in path[3:]
     locator = LOCATOR.fullmatch(node.text) if is_locator else None
     name, key = ".".join(map(str, path[:-1])), path[-1]
-    if key == "groups":
+    if key in ("group", "groups"):
         yield from _group_outside(f"'{key}' of {name}", node, networks)
         return
     try:
@@ -172,9 +192,10 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
 
 
 def _group_outside(what: str, node: ScalarNode, networks: Networks) -> Iterator[Diagnostic]:
-    if not any(ipaddress.IPv4Address(node.text) in network for network in networks.members):
-        hint = f"remove it, or add {node.text}/32 to `networks`: then anybody who sends to the group is received"
-        yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, f"{what} has {node.text}, outside {networks}", hint)
+    host, _, _ = node.text.partition(":")
+    if not any(ipaddress.IPv4Address(host) in network for network in networks.members):
+        hint = f"remove it, or add {host}/32 to `networks`: the group may have members in any network"
+        yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, f"{what} is {node.text}, outside {networks}", hint)
 
 
 def _moved(host: ipaddress.IPv4Address, network: ipaddress.IPv4Network) -> ipaddress.IPv4Address:

@@ -5,12 +5,12 @@ Mappings merge key by key; everything else is replaced. These mappings are also 
 two files ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and
 the reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a
 deadman is obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace
-each other. Every node keeps the span of its own file.
+each other, and so do `address`, `group` and `broadcast` of an endpoint. Every node keeps the span of its own file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,9 +29,16 @@ _DEPTH = len(("routes", "case"))
 """Depth of routes and gateways in a table."""
 _WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
 """Keys that disable a route, a gateway, or a part of one."""
-_ALTERNATIVES = {"topic": "topics", "topics": "topic"}
-"""Mutually exclusive keys of a route."""
-_WHOLE = ("source", "destinations", *_ALTERNATIVES)
+_ALTERNATIVES: Mapping[str, Mapping[str, Collection[str]]] = {
+    "routes": {"topic": ["topics"], "topics": ["topic"]},
+    "endpoints": {
+        "address": ["group", "interface", "hops", "broadcast"],
+        "group": ["address", "broadcast"],
+        "broadcast": ["address", "group", "interface", "hops"],
+    },
+}
+"""Keys of a route or an endpoint, each with those that it replaces."""
+_WHOLE = ("source", "destinations", "topic", "topics")
 """Keys of a route that take a single value or a list."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 """Parts of a route or gateway whose keys select their kind."""
@@ -68,11 +75,10 @@ def load_chain(
 
 def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode:
     """Merge `over` into `base`; both are at the path `here`."""
-    entries = dict(base.entries)
-    is_route = here[:1] == ("routes",) and len(here) == _DEPTH
+    alternatives = _ALTERNATIVES.get(str(here[0]), {}) if len(here) == _DEPTH else {}
+    replaced = {other for key in over.entries for other in alternatives.get(key, ())}
+    entries = {key: entry for key, entry in base.entries.items() if key not in replaced}
     for key, entry in over.entries.items():
-        if is_route and key in _ALTERNATIVES:
-            entries.pop(_ALTERNATIVES[key], None)
         below, above, path = entries[key].value if key in entries else None, entry.value, (*here, key)
         if isinstance(below, MappingNode) and isinstance(above, MappingNode) and not _replaces(above, below, path):
             entries[key] = Entry(entry.key, merge(below, above, path))

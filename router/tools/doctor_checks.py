@@ -24,7 +24,7 @@ from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
-from router.net.udp import absence, why_unreachable
+from router.net.udp import absence, why_no_way
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
 from router.table.model.endpoints import Endpoint, Listener, bound_to
@@ -328,7 +328,7 @@ def ways(program: CompiledTable, grade: Callable[[str, str, str], CheckResult]) 
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
         try:
-            unreachable = why_unreachable(address)
+            unreachable = why_no_way(endpoint)
         except BadAddressError as error:
             yield problem("endpoints", f"{endpoint.name}: {error.what}", error.hint)
             continue
@@ -344,7 +344,8 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
     """
     yield from ways(program, problem)
     known = program.table.endpoints.values()
-    reachable = {endpoint.name: endpoint.address.value.host for endpoint in known if _has_way(endpoint)}
+    one = [endpoint for endpoint in known if endpoint.is_one_machine and _has_way(endpoint)]
+    reachable = {endpoint.name: endpoint.address.value.host for endpoint in one}
     try:
         answered = answering(set(reachable.values()))
     except PermissionError:
@@ -364,7 +365,7 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
 
 def _has_way(endpoint: Endpoint) -> bool:
     try:
-        return why_unreachable(endpoint.address.value) is None
+        return why_no_way(endpoint) is None
     except BadAddressError:
         return False
 

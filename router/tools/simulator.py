@@ -248,15 +248,15 @@ class Simulator:
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
         address = endpoint.address.value
-        receiver = sender = self._open(address, endpoint.name)
+        receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)
         self._selector.register(receiver, selectors.EVENT_READ, (receiver, self.statistics.inboxes[endpoint.name]))
         self._senders[endpoint.name] = sender
 
-    def _open(self, address: Address, owner: str) -> socket.socket:
+    def _open(self, address: Address, owner: str, endpoint: Endpoint | None = None) -> socket.socket:
         try:
-            opened = open_udp(address, owner)
+            opened = open_udp(address, owner, endpoint)
         except UsageError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
                 raise UsageError(

@@ -16,7 +16,7 @@ from router.table.addresses import Address
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable
-    from router.table.model.endpoints import Listener
+    from router.table.model.endpoints import Endpoint, Listener
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"
@@ -95,20 +95,50 @@ def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
     return name_of
 
 
-def open_udp(address: Address, purpose: str) -> socket.socket:
-    """Open a non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
+def endpoint_of(text: str, table: RouteTable | None) -> Endpoint | None:
+    """Return the endpoint of the table with this name."""
+    return table.endpoints.get(text) if table is not None else None
+
+
+def open_udp(address: Address, purpose: str, endpoint: Endpoint | None = None) -> socket.socket:
+    """Open a non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message.
+
+    `endpoint`: has this address; if it is a multicast group, the socket shares the port and receives the group.
+    """
     from router.net.kernel import allow_fragments, why_not_bound
 
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         opened.setblocking(False)
         allow_fragments(opened)
+        if endpoint is not None and endpoint.group is not None:
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            _join(opened, address.host, endpoint.interface)
         opened.bind(address)
     except OSError as error:
         opened.close()
         _, why, remedy = why_not_bound("udp", address.port, error)
         raise UsageError(f"{purpose}: cannot bind {address}: {why}", remedy) from error
     return opened
+
+
+def _join(opened: socket.socket, group: str, interface: str | None) -> None:
+    """Join a group until the socket is closed. Raises UsageError or OSError."""
+    from router.net.multicast import Groups
+
+    groups = Groups(opened, interface)
+    groups.follow([group])
+    if groups.missing:
+        raise UsageError(f"cannot join {group}: {groups.missing[group]}")
+
+
+def aim(sender: socket.socket, to: Endpoint) -> None:
+    """Have a socket send to an endpoint that may be a multicast group or a broadcast address. Raises UsageError."""
+    from router.net import multicast
+
+    sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, to.broadcast is not None)
+    if to.group is not None and not multicast.aim(sender, to.interface, to.hops or 1, is_looped=True):
+        raise UsageError(f"cannot send to '{to.name}': there is no network interface '{to.interface}'")
 
 
 def _named(text: str, table: RouteTable | None) -> Address | None:

@@ -112,7 +112,7 @@ def test_the_broadcast_address_of_an_interface_is_refused(site: Rover) -> None:
     refused = site.rover.inside(lambda: RouterProcess(site.folder, path))
     assert refused.wait() == 78
     assert f"{path}:8:20: {said}" in refused.text()
-    assert "broadcast and multicast are not supported" in refused.text()
+    assert "an endpoint has `group` or `broadcast` instead" in refused.text()
     with site.router(TABLE.replace("10.79.9.9", "10.78.1.60")) as router:
         assert said in reload(site, router, wrong)
         assert not router.events("table reloaded")

@@ -34,7 +34,7 @@ def plan(
 
 
 def endpoint(name: str, address: Address) -> endpoints.Endpoint:
-    return endpoints.Endpoint(name, SPAN, Located(address, SPAN), EndpointKind.TOOL)
+    return endpoints.Endpoint(name, SPAN, Located(address, SPAN), kind=EndpointKind.TOOL)
 
 
 @pytest.fixture

@@ -69,9 +69,7 @@ def datagrams(draw: st.DrawFn) -> bytes:
 
 def endpoints() -> dict[str, Endpoint]:
     address = Located(Address(*SENSOR_BOARD), SPAN)
-    return {
-        "sensor_board": Endpoint("sensor_board", SPAN, address, EndpointKind.BOARD, None, trim_trailing_zeros=False)
-    }
+    return {"sensor_board": Endpoint("sensor_board", SPAN, address, kind=EndpointKind.BOARD, trim_trailing_zeros=False)}
 
 
 def table(**changed: Any) -> RouteTable:

@@ -109,7 +109,7 @@ def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: s
 def test_a_group_has_to_lie_in_them(tmp_path: Path) -> None:
     text = LOCAL.replace("127.0.0.1:5000}", "127.0.0.1:5000, groups: [224.5.23.2]}")
     [found] = outside(tmp_path, text)
-    assert found.startswith("'groups' of listen.rover has 224.5.23.2, outside the networks of")
+    assert found.startswith("'groups' of listen.rover is 224.5.23.2, outside the networks of")
     assert "add 224.5.23.2/32 to `networks`" in found
     assert outside(tmp_path, text.replace("/8]", "/8, 224.5.23.0/24]")) == []
 

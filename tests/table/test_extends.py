@@ -181,6 +181,18 @@ routes:
     assert [topic.topic.value for topic in routes["arm_ctrl"].source_topics] == ["b"]
 
 
+@pytest.mark.parametrize(
+    "one", ["address: 127.0.0.2:8", "group: '224.5.23.2:8', interface: lo", "broadcast: 127.255.255.255:8"]
+)
+@pytest.mark.parametrize("other", ["address: 127.0.0.3:9", "group: '224.5.23.3:9'", "broadcast: 127.255.255.255:9"])
+def test_address_group_and_broadcast_of_an_endpoint_replace_each_other(tmp_path: Path, one: str, other: str) -> None:
+    (tmp_path / "base.yaml").write_text(GOOD.replace("endpoints:\n", f"endpoints:\n  tracker: {{{one}, kind: tool}}\n"))
+    endpoint = good(tmp_path, f"extends: base.yaml\nendpoints: {{tracker: {{{other}}}}}\n").endpoints["tracker"]
+    assert f"{endpoint.address.value}" in other
+    assert [endpoint.unicast, endpoint.group, endpoint.broadcast].count(None) == 2
+    assert endpoint.interface == ("lo" if "group" in one and "group" in other else None)
+
+
 def test_a_map_of_values_an_each_and_a_quality_of_service_replace(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text(
         GOOD

@@ -19,7 +19,7 @@ from router.compiler.compiled_table import CompiledTable
 from router.errors import StartError
 from router.observe.problems import Kind, Problem
 from router.recording.writer import RecordingDirectory
-from router.table.addresses import Address
+from router.table.model.endpoints import Endpoint
 from router.tools import doctor_checks
 from router.tools.doctor import before_start, examine
 from router.tools.doctor_checks import (
@@ -411,10 +411,10 @@ def test_a_node_that_exits_while_the_doctor_looks_is_not_a_crash(tmp_path: Path)
 def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_warning(
     table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_way(address: Address) -> tuple[str, str] | None:
-        return ("no route leads there", "plug it in") if address.host == "127.0.0.30" else None
+    def no_way(endpoint: Endpoint) -> tuple[str, str] | None:
+        return ("no route leads there", "plug it in") if endpoint.name == "sensor_board" else None
 
-    monkeypatch.setattr(doctor_checks, "why_unreachable", no_way)
+    monkeypatch.setattr(doctor_checks, "why_no_way", no_way)
     text = "sensor_board: nothing can be sent to 127.0.0.30: no route leads there"
     [first, *others] = endpoints(compiled(table), {})
     assert first == (Grade.PROBLEM, "endpoints", text, "plug it in")
@@ -426,7 +426,7 @@ def test_a_broadcast_address_is_a_problem(table: Path) -> None:
     rewritten(table, "127.0.0.30:8", "127.255.255.255:8")
     [found] = before_start(table, {})
     text = "sensor_board: 127.255.255.255 is not the address of a single machine"
-    hint = "write the address of one machine: broadcast and multicast are not supported"
+    hint = "write the address of one machine; for several, an endpoint has `group` or `broadcast` instead"
     assert found == (Grade.PROBLEM, "endpoints", text, hint)
 
 

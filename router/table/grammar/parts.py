@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from router.table.grammar.keys import REASON, TEXT, Schema, about, key, mapping, part, properties, ref, required
-from router.table.grammar.rules import GATEWAY, LIMIT, ROUTE, STATE, alone, without
+from router.table.grammar.rules import ENDPOINT, GATEWAY, LIMIT, ROUTE, STATE, alone, without
 from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
@@ -179,7 +179,7 @@ _DEFAULTS = key("Defaults", "Values for parts of the table that do not set their
 
 PARTS: Schema = {
     "listener": part(Listener),
-    "endpoint": part(Endpoint),
+    "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,
     "case": _CASE,
     "route": _ROUTE,

@@ -68,7 +68,13 @@ COMPLETE: Schema = {
             "record": {"required": required(RecordSettings)},
             "foxglove": {"required": ["address"]},
             "listen": _each({"required": required(Listener)}),
-            "endpoints": _each({"required": required(Endpoint)}),
+            "endpoints": _each(
+                {
+                    "required": required(Endpoint),
+                    "if": {"anyOf": [{"required": ["group"]}, {"required": ["broadcast"]}]},
+                    "else": {"required": ["address"]},
+                }
+            ),
             "state": _each(
                 {
                     "required": required(State),
@@ -147,6 +153,20 @@ STATE: Sequence[Schema] = [
         "if": {"required": ["topic"]},
         "then": without("case|source", "is for a state that datagrams set; it is not allowed with 'topic'"),
         "else": without("type|queue_depth|qos", "is for a state that a topic sets; it needs 'topic', which is missing"),
+    },
+]
+
+# -- of endpoints
+
+ENDPOINT: Sequence[Schema] = [
+    {
+        "if": {"required": ["group"]},
+        "then": without("address|broadcast", "is not allowed with 'group'; an endpoint has one destination"),
+        "else": without("interface|hops", "needs 'group', which is missing here"),
+    },
+    {
+        "if": {"required": ["broadcast"]},
+        "then": without("address", "is not allowed with 'broadcast'; an endpoint has one destination"),
     },
 ]
 

@@ -1,11 +1,11 @@
 """UDP addresses: the listeners of the router, and the endpoints that it knows."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
-from router.table.addresses import LOCAL, REMOTE, Address
+from router.table.addresses import BROADCAST, GROUP, LOCAL, REMOTE, Address
 from router.table.keys import Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.units import DATA_RATE, PATIENCE, SIZE
@@ -84,19 +84,42 @@ EPHEMERAL = "ephemeral"
 class Endpoint:
     """A named UDP address: a board, a basestation, a tool.
 
-    `span` is its name in the table. `bandwidth` is in bytes per second, `stale_after` in ns, None for never.
-    `send_from` is a listener's name, EPHEMERAL, or None if it is not set.
+    `span` is its name in the table. It has one of `unicast`, `group` and `broadcast`. `bandwidth` is in bytes per
+    second, `stale_after` in ns, None for never. `send_from` is a listener's name, EPHEMERAL, or None if it is not set.
     """
 
     name: str
     span: SourceSpan
-    address: Annotated[Located[Address], REMOTE]
+    unicast: Annotated[Located[Address] | None, REMOTE, Named("address")] = None
     """Where datagrams to it are sent. Datagrams from it are recognised by the IP address.
 
     Title: Endpoint address
     Example: 192.168.0.30:8
     """
-    kind: EndpointKind
+    group: Annotated[Located[Address] | None, GROUP] = None
+    """In place of `address`: the multicast group and port that datagrams are sent to. It is no sender, and no board.
+
+    Title: Multicast group
+    Example: 224.5.23.2:10010
+    """
+    interface: Annotated[str | None, Shape("interface")] = None
+    """Send to the group on this network interface. Default: that of the route to the group.
+
+    Example: eth0
+    """
+    hops: Annotated[int | None, Range(1, 255)] = None
+    """How many networks datagrams to the group may pass, the first one included. Default: 1, so they reach no other
+    network.
+
+    Example: 1
+    """
+    broadcast: Annotated[Located[Address] | None, BROADCAST] = None
+    """In place of `address`: the broadcast address of a network, and the port. It is no sender, and no board.
+
+    Title: Broadcast address
+    Example: 192.168.0.255:4444
+    """
+    kind: EndpointKind = field(kw_only=True)
     """board: a microcontroller that decodes into fixed-size structures, so datagrams for it are checked against their
     limits. basestation or tool: an ordinary computer.
 
@@ -150,3 +173,14 @@ class Endpoint:
 
     Example: {seq: sequence, sent_at: now, robot: 3}
     """
+
+    @property
+    def address(self) -> Located[Address]:
+        """Where datagrams to it are sent."""
+        address = self.unicast or self.group or self.broadcast
+        assert address is not None  # noqa: S101 - the schema requires one
+        return address
+
+    @property
+    def is_one_machine(self) -> bool:
+        return self.unicast is not None
