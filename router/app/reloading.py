@@ -16,7 +16,9 @@ from router.compiler import check_table
 from router.compiler.check import Checked, uncollected
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
+from router.compiler.resolution import names, resolved
 from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
+from router.image.writer import write_image
 from router.log import fault, logger
 from router.observe.running import ReloadResult
 from router.table.keys import are_same
@@ -31,7 +33,8 @@ _MOST_NAMED = 12
 class Reloader:
     """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `replaced` is called once another program runs and the earlier one is closed. `saver` saves its image.
+    `replaced` is called once another program runs and the earlier one is closed. `saver` saves its image. `hosts`
+    returns the addresses of host names.
     """
 
     def __init__(
@@ -40,8 +43,10 @@ class Reloader:
         environ: Mapping[str, str] | None,
         replaced: Callable[[], None],
         saver: ImageSaver | None = None,
+        hosts: Callable[[], Mapping[str, str]] = dict,
     ) -> None:
         self._runtime = runtime
+        self._hosts = hosts
         self._counts = runtime.counts
         self._environ = environ
         self._replaced = replaced
@@ -96,6 +101,20 @@ class Reloader:
                 names = [each.name for each in replaceable]
                 logger.info("these listeners now receive: their networks are up", listeners=names)
 
+    def readdress(self) -> bool:
+        """Send to the present addresses of host names, and recognise senders by them. Return whether that is done."""
+        with self._one_at_a_time:
+            program = self._runtime.program
+            if not self._is_open or program is None:
+                return False
+            try:
+                self._runtime.take_over(resolved(program, self._hosts()))
+            except (StartError, StuckError, OSError) as error:
+                logger.warning("another address of a host name cannot be adopted", why=str(error))
+                return False
+            self._notify_replaced()
+            return True
+
     def _attempt(self, now: CompiledTable) -> tuple[str, ReloadResult]:
         """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
@@ -106,6 +125,7 @@ class Reloader:
             then = checked.program_in(now.counters.continued())
             if then is None:
                 return "invalid", _refused(findings)
+            then = resolved(then, self._hosts())
             if refused := _unchangeable(now.table, then.table):
                 return "invalid", _refused([*findings, *refused])
             text = _changes(now, then)
@@ -125,7 +145,8 @@ class Reloader:
         else:
             self._notify_replaced()
             if self._saver is not None and (image := self._runtime.plane.image) is not None:
-                self._saver.save(image.image, read)
+                # Another process resolves the names itself.
+                self._saver.save(write_image(then.named) if names(then) and then.named else image.image, read)
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
 

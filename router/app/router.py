@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from router import __version__
 from router.app.change import Change
 from router.app.counts import ThreadCounts
+from router.app.host_names import HostNames
 from router.app.image_saver import ImageSaver
 from router.app.plane import Plane
 from router.app.reloading import Reloader
@@ -22,6 +23,7 @@ from router.carrier.forwarding import Forwarding
 from router.clock import boottime_ns
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Evidence, Mismatch
+from router.compiler.resolution import names, why_unusable
 from router.compiler.topics import DIAGNOSTICS
 from router.library import library
 from router.log import logger
@@ -87,7 +89,10 @@ class Router:
         self._runtime = Runtime(plane, forwarding, self._reporter, ros_args, head_start)
         self._services = Services(self, self._runtime.gateways.refused)
         self._saver = saver
-        self._reloader = Reloader(self._runtime, environ, self._replaced, saver)
+        self._reloader = Reloader(self._runtime, environ, self._replaced, saver, lambda: self._host_names.hosts)
+        self._host_names = HostNames(
+            self._reloader.readdress, self._is_silent, lambda name, host: why_unusable(self.program, name, host)
+        )
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
         self._known: Mapping[str, int] = dict.fromkeys(program.table.endpoints, boottime_ns())
@@ -112,6 +117,7 @@ class Router:
                 self._open_services(change, services)
             self._reloader.open()
             opening.callback(self._unwatch_all)
+            opening.callback(self._host_names.close)
             self._watch()
             opening.callback(self._reloader.close)
             self._open = opening.pop_all()
@@ -232,13 +238,22 @@ class Router:
         self._watch()
 
     def _watch(self) -> None:
-        """Watch the network interfaces of listeners, and the table's files if the table says so."""
+        """Watch network interfaces, host names, and the table's files if the table says so."""
+        self._host_names.follow({*names(self.program).values()})
         if self._interfaces is None and self._runtime.sockets.may_lose_interfaces:
             self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:
             self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)
         elif not self.program.table.reload_on_change:
             self._unwatch()
+
+    def _is_silent(self, host: str) -> bool:
+        """Return whether an endpoint with this host name has not been heard for longer than `stale_after`."""
+        metric = "endpoint_silence_seconds"
+        now = self.read(boottime_ns(), (metric,))
+        ours = (self.program.table.endpoints[name] for name, each in names(self.program).items() if each == host)
+        limits = {each.name: each.stale_after / 1e9 for each in ours if each.stale_after is not None}
+        return any(now.of(metric, name).get((), 0.0) > limit for name, limit in limits.items())
 
     def _unwatch(self) -> None:
         if self._watcher is not None:
@@ -260,6 +275,9 @@ class Router:
             **self._services.computed_series(),
             "connections_refused": lambda: [
                 ((server,), n) for server, n in list(self._runtime.gateways.refused.items())
+            ],
+            "endpoint_unresolved": lambda: [
+                ((name,), self.program.table.endpoints[name].address.value.is_name) for name in names(self.program)
             ],
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "groups_not_joined": lambda: [

@@ -127,7 +127,8 @@ class Sockets:
                 beside = source.opened if source is not None else None
                 wanted, (known, sender) = destination(program.table, to), self._senders.get(to.name, (None, None))
                 is_new = sender is None or known != wanted
-                _check_reachable(to, is_new)
+                if not to.address.value.is_name:
+                    _check_reachable(to, is_new)
                 if sender is None or is_new:
                     opened = open_sending(to, source, every)
                     address, _, cast = wanted
@@ -137,7 +138,8 @@ class Sockets:
                     opened = open_sending(to, source, every)
                     opening.callback(opened.close)
                     moves.append((sender, beside, opened))
-                _check_source(to, sender)
+                if not to.address.value.is_name:
+                    _check_source(to, sender)
                 senders[to.name] = sender
             used = [each.opened for each in listeners.values()]
             left: list[Listener | ListeningSocket] = [each for each in self._bound.values() if each.opened not in used]

@@ -243,7 +243,7 @@ class CompiledTable:
 
     `inbound` has the routes by envelope field number; several routes of a case differ in their sources. `outbound` has
     the routes by topic. `ignored` has the numbers of ignored members of the envelope's oneof, `boards` the limits of
-    each board by name.
+    each board by name. `named` is the table with the host names that this one has replaced by addresses, or None.
     """
 
     table: RouteTable
@@ -261,6 +261,7 @@ class CompiledTable:
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
     states: tuple[StatePlan, ...] = ()
+    named: CompiledTable | None = None
 
     @property
     def listeners(self) -> tuple[Listener, ...]:

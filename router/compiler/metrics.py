@@ -123,6 +123,7 @@ METRICS = (
         ("endpoint",),
         "How long ago the endpoint was first heard since its last silence; no series until it has sent.",
     ),
+    Metric("endpoint_unresolved", "number", ("endpoint",), "1 while its host name is not resolved."),
     Metric("endpoint_silences", "counter", ("endpoint",), "How often the endpoint was heard again after a silence."),
     Metric("endpoint_last_silence_seconds", "time", ("endpoint",), "How long the last such silence was."),
     Metric(

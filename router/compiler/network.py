@@ -94,7 +94,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
         if other.receive is not None:
             own["'receive' address" if other is gateway else f"gateway '{other.name}'"] = other.receive.value
     for name, local in own.items():
-        if _reaches(address.value, local):
+        if reaches(address.value, local):
             message = f"'{gateway.name}' would send to the router's own {name} ({address.value})"
             yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "write the address of its client")
 
@@ -185,14 +185,15 @@ def loop_finding(
     for listener in table.listeners.values():
         own = listener.address.value
         returns = endpoint.broadcast is not None and own == (WILDCARD, endpoint.broadcast.value.port)
-        if returns or _reaches(endpoint.address.value, own):
+        if returns or reaches(endpoint.address.value, own):
             message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
             hint = "remove it, or correct its address: datagrams would return to the router in an endless loop"
             return Diagnostic(span, Code.FORWARDING_LOOP, message, hint)
     return None
 
 
-def _reaches(address: Address, own: Address) -> bool:
+def reaches(address: Address, own: Address) -> bool:
+    """Return whether datagrams to an address arrive at a listener of this computer."""
     if address.port != own.port:
         return False
     return address.host in (own.host, WILDCARD) or (own.host == WILDCARD and address.host.startswith(LOOPBACK))
@@ -230,14 +231,16 @@ def recognisers(
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
-    Endpoints of other listeners are omitted. If `listener` is None, no endpoint is omitted. An IP
-    address that several endpoints share without source ports identifies none of them; this is only valid if none is a
-    source.
+    Endpoints of other listeners are omitted, unless `listener` is None, and those whose host name is not resolved. An
+    IP address that several endpoints share without source ports identifies none of them; this is only valid if none is
+    a source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}
     for endpoint in endpoints.values():
         if listener is not None and endpoint.listener is not None and endpoint.listener.value != listener:
+            continue
+        if endpoint.address.value.is_name:
             continue
         host = endpoint.address.value.host
         if endpoint.source_port is not None:

@@ -30,6 +30,7 @@ from router.compiler.metrics import (
     UNSAVED_REASONS,
     Counters,
 )
+from router.compiler.resolution import unresolved
 from router.table.model import RouteTable
 from router.table.model.routes import ROS
 from router.types.protobuf import Envelope
@@ -81,6 +82,7 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
     _open_each(counters, "unhandled", last=(*envelope.numbers, UNKNOWN_CASE))
     for metric in ENDPOINT_METRICS:
         _open_each(counters, metric, last=table.endpoints)
+    _open_each(counters, "endpoint_unresolved", last=unresolved(table))
 
 
 def _open_own(counters: Counters, table: RouteTable) -> None:

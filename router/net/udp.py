@@ -170,6 +170,11 @@ def _refused(settings: endpoints.Listener, error: OSError) -> StartError:
     return kind(f"{settings.address.span}: {what}: {why}", hint)
 
 
+def addresses_of(host: str) -> list[str]:
+    """Return the IPv4 addresses of a host name. It may take as long as the resolver does. Raises OSError."""
+    return [str(found[4][0]) for found in socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)]
+
+
 def nobody_listens(address: Address) -> str:
     """Return the meaning of "Connection refused" for UDP: the computer answers, but no process has the port."""
     return f"nobody listens at {address}"
@@ -177,6 +182,8 @@ def nobody_listens(address: Address) -> str:
 
 def why_not_sent(error: OSError, address: Address) -> str:
     """Describe why nothing was sent to an address, with a command that shows more."""
+    if address.is_name:
+        return f"the host name {address.host} is not resolved: `getent ahostsv4 {address.host}`"
     ask = f"`ip route get {address.host}`"
     match error.errno:
         case errno.ECONNREFUSED:

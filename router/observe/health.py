@@ -110,7 +110,7 @@ _MORE: Mapping[Kind, str] = {
 }
 """The text that gives the value, for kinds where it matters."""
 
-_GAUGES = (Kind.LISTENER_WAITING, Kind.NODE_NAME_TAKEN, *_MORE)
+_GAUGES = (Kind.LISTENER_WAITING, Kind.ENDPOINT_UNRESOLVED, Kind.NODE_NAME_TAKEN, *_MORE)
 _LOSSES = (
     Kind.DEADMAN_CANNOT_SEND,
     *DROPS,

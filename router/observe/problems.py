@@ -60,6 +60,12 @@ class Kind(enum.Enum):
         "Bring its network up, add a route to the group, or give {listener} an `interface`; `router doctor` names it.",
         "groups_not_joined",
     )
+    ENDPOINT_UNRESOLVED = (
+        Level.CRITICAL,
+        "{endpoint} gets nothing: its host name is not resolved",
+        "Check the name with `getent ahostsv4 {address}`, or give {endpoint} its IP address.",
+        "endpoint_unresolved",
+    )
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",

@@ -10,6 +10,7 @@ from typing import NamedTuple, Union
 
 from router.compiler import Checked
 from router.compiler.compiled_table import CompiledTable
+from router.compiler.resolution import names, resolved
 from router.datagrams import Peer, Wire
 from router.errors import DecodeError, MappingError
 from router.recording.mirror import Classifier
@@ -64,7 +65,9 @@ class Against:
         self.datagrams = 0
         self.span = 0
         self.senders: set[tuple[str, str, Peer]] = set()
-        self._programs = (old, new)
+        self._programs = [old, new]
+        self._hosts: tuple[dict[str, str], ...] = ({}, {})
+        """Addresses of host names, as in the recording."""
         self._runs: tuple[Rehearsal, ...] = ()
         self._first = self._start = 0
         self._unmatched: tuple[Counter[tuple[str, bytes]], ...] = (Counter(), Counter())
@@ -77,8 +80,9 @@ class Against:
         self.datagrams += 1
         self.span = datagram.steady - self._first
         self.senders.add((datagram.endpoint, datagram.listener, datagram.peer))
-        for run, program in zip(self._runs, self._programs, strict=True):
+        for side, run in enumerate(self._runs):
             run.advance(self._start + self.span)
+            program = self._resolve(side, datagram)
             if datagram.listener in program.table.listeners:
                 run.datagram(datagram.listener, datagram.peer, datagram.data)
             else:
@@ -86,6 +90,16 @@ class Against:
         old, new = (self._deliveries(side) for side in (0, 1))
         for target in dict.fromkeys((*old, *new)):
             self._compare(old.get(target, []), new.get(target, []))
+
+    def _resolve(self, side: int, datagram: Recorded) -> CompiledTable:
+        """Return the program of a side, after its endpoint with a host name has got the address of the sender."""
+        program, hosts, (address, _) = self._programs[side], self._hosts[side], datagram.peer
+        host = names(program).get(datagram.endpoint)
+        if host is not None and hosts.get(host) != address:
+            hosts[host] = address
+            self._programs[side] = program = resolved(program, hosts)
+            self._runs[side].reload(program)
+        return program
 
     @property
     def differs(self) -> bool:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from router.compiler import Checked, check_table
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.lookup import Definitions
+from router.compiler.resolution import with_stand_ins
 from router.errors import (
     Code,
     Diagnostic,
@@ -89,13 +90,14 @@ def read_test_file(path: Path, definitions: Definitions) -> TestFile:
     if checked.program.table.routes_span is None:
         message, hint = f"{shown_path(checked.path)} has no routes", "only routes are tested, gateways are not"
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
-    reader = _Reader(Names(checked, checked.program))
+    program = with_stand_ins(checked.program)
+    reader = _Reader(Names(checked, program))
     tests = root.get("tests")
     assert isinstance(tests, MappingNode)  # noqa: S101 - the schema saw to it
     read = tuple(reader.test(name, entry.key.span, entry.value) for name, entry in tests.entries.items())
     if reader.findings:
         raise TableError(reader.findings)
-    return TestFile(checked, checked.program, read)
+    return TestFile(checked, program, read)
 
 
 def _table_of(root: MappingNode, path: Path) -> Path:

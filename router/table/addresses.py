@@ -1,6 +1,6 @@
 """Addresses of a table: strict parsing of IPv4 literals with a port, and the check that they lie in `networks`.
 
-Host names are never resolved, so a table means the same on every machine.
+Only endpoints may have host names, which the running router resolves: a table compiles alike on every machine.
 """
 
 from __future__ import annotations
@@ -19,10 +19,15 @@ if TYPE_CHECKING:
 
 
 class Address(NamedTuple):
-    """An IPv4 address and a UDP (for metrics: TCP) port."""
+    """An IPv4 address, or the host name of an endpoint, and a UDP (for metrics: TCP) port."""
 
     host: str
     port: int
+
+    @property
+    def is_name(self) -> bool:
+        """Whether the host is a name that is not resolved."""
+        return not self.host.replace(".", "").isdigit()
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
@@ -31,6 +36,10 @@ class Address(NamedTuple):
 _EXAMPLE = "write an IPv4 address and a port, such as 192.168.0.30:8"
 _NO_MULTICAST = "write the address of one machine; for several, an endpoint has `group` or `broadcast` instead"
 _NO_LOCAL_MULTICAST = "write an address of this machine, or 0.0.0.0 for all of them"
+_LABEL = "[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+NAME = re.compile(rf"(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}")
+"""A host name. Its last part begins with a letter, so it is no misspelt IPv4 address."""
+_LONGEST_NAME = 253
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
 LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
@@ -70,6 +79,17 @@ def parse_remote(text: str) -> Address:
     return address
 
 
+def parse_endpoint(text: str) -> Address:
+    """Parse the address of a single machine, or its host name and a port. Raises BadAddressError."""
+    host, _, port = text.rpartition(":")
+    if NAME.fullmatch(host) and len(host) <= _LONGEST_NAME:
+        return Address(host.lower(), parse_address(f"127.0.0.1:{port}").port)
+    if host and ":" not in host and not _NUMBERS.fullmatch(host):
+        what = f"'{host}' is neither an IPv4 address nor a host name"
+        raise BadAddressError(what, "write an address and a port, such as 192.168.0.30:8 or robot3.local:8")
+    return parse_remote(text)
+
+
 def not_one_machine(address: Address) -> BadAddressError:
     return BadAddressError(f"{address.host} is not the address of a single machine", _NO_MULTICAST)
 
@@ -101,6 +121,7 @@ def parse_broadcast(text: str) -> Address:
 
 
 REMOTE = Quantity("address", parse_remote, str)
+ENDPOINT = Quantity("endpoint_address", parse_endpoint, str)
 GROUP = Quantity("address", parse_group, str)
 BROADCAST = Quantity("address", parse_broadcast, str)
 LOCAL = Quantity("address", parse_local, str)
@@ -122,7 +143,7 @@ def _is_octet(text: str) -> bool:
 def _bad_host(host: str) -> BadAddressError:
     if not _NUMBERS.fullmatch(host):
         example = "127.0.0.1" if host == "localhost" else "an IPv4 address such as 192.168.0.30"
-        hint = f"write {example}: host names are not resolved"
+        hint = f"write {example}: only endpoints may have host names"
         return BadAddressError(f"'{host}' is not an IPv4 address", hint)
     parts = host.split(".")
     if len(parts) != 4:
@@ -176,9 +197,10 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     try:
         address = parse_address(locator["address"] if locator else node.text)
     except BadAddressError:
-        if is_locator:  # a host name, IPv6, a path; invalid addresses of other kinds already have a finding
+        # A host name, IPv6, a path; invalid addresses of other kinds already have a finding.
+        if is_locator or NAME.fullmatch(node.text.rpartition(":")[0]):
             what = f"'{node.text}' under '{key}' of {name} has no IPv4 address to compare with {networks}"
-            remedy = _remedy(path, "tcp/127.0.0.1:7447", networks, is_extended)
+            remedy = _remedy(path, "tcp/127.0.0.1:7447" if is_locator else "127.0.0.1:8", networks, is_extended)
             yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, remedy)
         return
     host = ipaddress.IPv4Address(address.host)

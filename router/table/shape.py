@@ -12,7 +12,7 @@ from functools import partial
 
 from router.errors import Code, Diagnostic, SourceSpan, nearest
 from router.table import key_hints
-from router.table.addresses import BadAddressError, parse_address
+from router.table.addresses import BadAddressError, parse_address, parse_endpoint
 from router.table.compose import resolve, truth_of
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten
 from router.table.reading import mapping, scalar
@@ -247,7 +247,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
         what = f"{name} {_expected(error)}, not {shown(error.value)}"
         return Diagnostic(span, Code.WRONG_TYPE, what, key_hints.for_type(error, tree))
     if keyword == "pattern" and path[-1] in key_hints.ADDRESSES:
-        return _bad_address(str(error.value), span)
+        return _bad_address(str(error.value), span, is_endpoint=path[0] == "endpoints" and path[-1] == "address")
     if keyword == "uniqueItems":
         return _repeated(error, tree)
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
@@ -334,12 +334,12 @@ def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
     return Diagnostic(span, Code.MISSING_KEY, f"{subject(error.path)} lacks the key '{missing}'", hint)
 
 
-def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
+def _bad_address(text: str, span: SourceSpan, *, is_endpoint: bool) -> Diagnostic:
     try:
-        parse_address(text)
+        (parse_endpoint if is_endpoint else parse_address)(text)
     except BadAddressError as error:
         return Diagnostic(span, Code.BAD_ADDRESS, error.what, key_hints.as_variable(text) or error.hint)
-    raise AssertionError(f"the schema rejects the address '{text}', parse_address accepts it")
+    raise AssertionError(f"the schema rejects the address '{text}', the parser accepts it")
 
 
 def _repeated(error: SchemaError, tree: Node) -> Diagnostic:

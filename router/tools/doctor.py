@@ -37,6 +37,7 @@ from router.tools.doctor_checks import (
     ways,
 )
 from router.tools.multicast_checks import groups
+from router.tools.name_checks import Names
 from router.tools.running_router import Health, health, url_of
 
 
@@ -62,7 +63,9 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     yield from shared_memory(variables)
     yield from open_domain(program, variables)
     yield from clock()
-    yield from endpoints(program, _in_place_of(running))
+    found = Names(program)
+    yield from found.results()
+    yield from endpoints(found.program, _in_place_of(running))
     yield from _running(program, running)
 
 
@@ -80,11 +83,13 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     problems = [result for result in chain.from_iterable(needed) if result.grade is Grade.PROBLEM]
     yield from problems
     if program is not None:
+        found = Names(program)
+        yield from (result._replace(grade=Grade.WARNING) for result in found.results() if result.grade != Grade.FINE)
         if not any(result.about == "ROS" for result in problems):
             yield from ros_peers(program)
         networks = chain(listeners(program), groups(program))
         yield from (result for result in networks if result.grade is not Grade.FINE)
-        yield from ways(program, warning)
+        yield from ways(found.program, warning)
 
 
 def _table(checked: Checked) -> Iterator[CheckResult]:

@@ -327,6 +327,8 @@ def ways(program: CompiledTable, grade: Callable[[str, str, str], CheckResult]) 
     """Check that an IP route leads to each endpoint. `grade` makes the result if none does."""
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
+        if address.is_name:
+            continue
         try:
             unreachable = why_no_way(endpoint)
         except BadAddressError as error:
@@ -365,7 +367,7 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
 
 def _has_way(endpoint: Endpoint) -> bool:
     try:
-        return why_no_way(endpoint) is None
+        return not endpoint.address.value.is_name and why_no_way(endpoint) is None
     except BadAddressError:
         return False
 

@@ -28,7 +28,7 @@ from router.table.model.routes import ANY
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
-from router.tools.udp import LOOPBACK, listener_address, open_udp
+from router.tools.udp import LOOPBACK, listener_address, located, open_udp
 from router.types.model import Int, MessageType
 from router.types.paths import type_at
 from router.types.protobuf import PayloadCase
@@ -247,7 +247,7 @@ class Simulator:
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
-        address = endpoint.address.value
+        address = located(endpoint.address.value)
         receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)

@@ -52,7 +52,7 @@ def origin(text: str, table: RouteTable | None) -> Address:
     """Parse `HOST[:PORT]`, or an endpoint's name: its host, and its `source_port` if it has one. Raises UsageError."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
-        return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)
+        return Address(located(endpoint.address.value).host, endpoint.source_port.value if endpoint.source_port else 0)
     host, colon, port = text.partition(":")
     if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
         raise _not_a_place(text, table, "HOST[:PORT]")
@@ -145,7 +145,12 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
     if table is None:
         return None
     named = table.endpoints.get(text) or table.listeners.get(text)
-    return None if named is None else named.address.value
+    return None if named is None else located(named.address.value)
+
+
+def located(address: Address) -> Address:
+    """Return an address with an IPv4 address in place of its host name. Raises UsageError."""
+    return address._replace(host=_resolve(address.host)) if address.is_name else address
 
 
 def _refuse_port_of_name(host: str, text: str, table: RouteTable | None) -> None:

@@ -106,6 +106,15 @@ def test_where_one_table_knows_the_senders_no_other_network_is_named(
     assert not any("came from:" in line for line in found.lines)
 
 
+def test_host_names_have_the_addresses_of_the_recording(tmp_path: Path) -> None:
+    named = program(tmp_path, FORWARD, HEAD.replace("192.168.0.30:8", "board.local:8"))
+    against = Against(program(tmp_path, FORWARD), named)
+    for found in Recording(recorded(tmp_path / "it.mcap", *batches())).datagrams():
+        against.take(found._replace(endpoint="sensor_board" if found.peer == SENSOR_BOARD else ""))
+    assert not against.differs
+    assert against.rows["imu_info", "basestation"].same == 3
+
+
 def test_a_changed_mapping_is_told_field_by_field(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = Compared(tmp_path, TOPIC.replace("FIELD", "accel_x"), TOPIC.replace("FIELD", "2 * accel_x"), capsys)
     assert found.code == 1

@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.errors import Code
-from router.table.addresses import ADDRESSES, BadAddressError, parse_address
+from router.table.addresses import ADDRESSES, BadAddressError, parse_address, parse_endpoint
 from router.table.schema import table_schema
 from tests.table.tables import load, references
 
+DEFINITIONS = "address", "endpoint_address", "group"
+ENDPOINT = table_schema()["definitions"]["endpoint_address"]["pattern"]
 PATTERN = table_schema()["definitions"]["address"]["pattern"]
 
 octets = st.one_of(st.integers(0, 400).map(str), st.sampled_from(["01", "", "0", "255", "256", "x"]))
@@ -53,6 +55,22 @@ def test_the_schema_and_the_parser_agree(text: str) -> None:
         assert not re.fullmatch(PATTERN, text)
     else:
         assert re.fullmatch(PATTERN, text)
+
+
+@given(
+    st.builds("{}.{}.{}.{}:{}".format, octets, octets, octets, octets, ports)
+    | st.text("0123456789aZ-_.:", max_size=21)
+    | st.sampled_from(["robot-3.local:8", "a:8", "a.:8", "-a:8", "a..b:8", "1.2.3.4a:8", "a.3d:8", "9a.b:8"])
+)
+def test_so_they_do_about_host_names(text: str) -> None:
+    try:
+        address = parse_endpoint(text)
+    except BadAddressError:
+        assert not re.fullmatch(ENDPOINT, text) or not 0 < int(text.partition(".")[0]) < 224
+    else:
+        assert re.fullmatch(ENDPOINT, text)
+        assert address.is_name == (not re.fullmatch(PATTERN, text))
+        assert str(address) == text.lower()
 
 
 LOCAL = """\
@@ -115,7 +133,7 @@ def test_a_group_has_to_lie_in_them(tmp_path: Path) -> None:
 
 
 def test_no_address_of_the_schema_is_left_out() -> None:
-    found = {path for path, definition in references(table_schema()) if definition in ("address", "group")}
+    found = {path for path, definition in references(table_schema()) if definition in DEFINITIONS}
     assert found == {pattern[: 3 if "groups" in pattern else None] for pattern in ADDRESSES if "zenoh" not in pattern}
 
 
@@ -143,4 +161,4 @@ def test_no_name_is_looked_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(socket, name, asked)
     assert len(outside(tmp_path, LOCAL.replace("tcp/127.0.0.1:7447", "tcp/localhost:7447"))) == 1
     _, [found] = load(tmp_path, LOCAL.replace("127.0.0.30:8", "localhost:8"))
-    assert found.code is Code.BAD_ADDRESS
+    assert found.code is Code.OUTSIDE_NETWORKS

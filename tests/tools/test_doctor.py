@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import socket
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from datetime import datetime, timezone
@@ -20,7 +21,7 @@ from router.errors import StartError
 from router.observe.problems import Kind, Problem
 from router.recording.writer import RecordingDirectory
 from router.table.model.endpoints import Endpoint
-from router.tools import doctor_checks
+from router.tools import doctor_checks, name_checks
 from router.tools.doctor import before_start, examine
 from router.tools.doctor_checks import (
     CheckResult,
@@ -41,6 +42,7 @@ from router.tools.doctor_checks import (
     shared_memory,
     warning,
 )
+from router.tools.name_checks import Names
 from tests.ports import free_port
 from tests.tools.answering import answering
 
@@ -420,6 +422,40 @@ def test_an_endpoint_that_no_route_leads_to_is_a_problem_and_before_the_start_a_
     assert first == (Grade.PROBLEM, "endpoints", text, "plug it in")
     assert "sensor_board" not in " ".join(finding.text for finding in others)
     assert list(before_start(table, {})) == [(Grade.WARNING, "endpoints", text, "plug it in")]
+
+
+@pytest.mark.parametrize(
+    ("found", "grade", "text"),
+    [
+        (["127.0.0.41"], Grade.FINE, "sensor_board: robot.local is 127.0.0.41"),
+        (["224.0.0.1", "127.0.0.41"], Grade.FINE, "sensor_board: robot.local is 127.0.0.41"),
+        (["224.0.0.1"], Grade.PROBLEM, "224.0.0.1 is not the address of a single machine"),
+        (OSError(-2, "Name or service not known"), Grade.PROBLEM, "is not resolved: Name or service not known"),
+        (None, Grade.PROBLEM, "the resolver does not answer within 5 s"),
+    ],
+)
+def test_the_host_names_of_endpoints_are_resolved(
+    table: Path, monkeypatch: pytest.MonkeyPatch, found: list[str] | OSError | None, grade: Grade, text: str
+) -> None:
+    never = threading.Event()
+
+    def answer(host: str) -> list[str]:
+        assert host == "robot.local"
+        if found is None:
+            never.wait(60)
+        if isinstance(found, OSError):
+            raise found
+        return found or []
+
+    monkeypatch.setattr(name_checks, "addresses_of", answer)
+    names = Names(rewritten(table, "127.0.0.30:8", "robot.local:8"), patience=0.2 if found is None else 60)
+    [result] = names.results()
+    never.set()
+    assert (result.grade, result.about) == (grade, "names")
+    assert text in result.text
+    if grade is Grade.PROBLEM:
+        assert list(endpoints(names.program, {}))
+        assert "sensor_board" not in " ".join(each.text for each in endpoints(names.program, {}))
 
 
 def test_a_broadcast_address_is_a_problem(table: Path) -> None:

@@ -17,6 +17,7 @@ and editors show another key's title.
 _OCTET = "(?:25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _HOST = rf"(?:{_OCTET}\.){{3}}{_OCTET}"
 _GROUP = rf"(?:22[4-9]|23[0-9])(?:\.{_OCTET}){{3}}"
+_LABEL = "[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _PORT = "(?:[1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _POSITIVE = rf"(?=[0-9.]*[1-9]){_NUMBER}"
@@ -66,6 +67,10 @@ def _text_or(otherwise: Schema) -> Schema:
 VALUES: Schema = {
     "variable": {"type": "string", "pattern": _VARIABLE},
     "address": _text(f"^{_HOST}:{_PORT}$", "be an IPv4 address and a port, such as '192.168.0.30:8'"),
+    "endpoint_address": _text(
+        rf"^(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}$",
+        "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8'",
+    ),
     "network": _text(f"^{_HOST}/(?:3[0-2]|[12]?[0-9])$", "be an IPv4 network, such as '127.0.0.0/8'"),
     "group": _text(
         f"^{_GROUP}$", "be a multicast group, from 224.0.0.0 to 239.255.255.255, such as '224.5.23.2'"

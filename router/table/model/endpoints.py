@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
-from router.table.addresses import BROADCAST, GROUP, LOCAL, REMOTE, Address
+from router.table.addresses import BROADCAST, ENDPOINT, GROUP, LOCAL, Address
 from router.table.keys import Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.units import DATA_RATE, PATIENCE, SIZE
@@ -90,11 +90,13 @@ class Endpoint:
 
     name: str
     span: SourceSpan
-    unicast: Annotated[Located[Address] | None, REMOTE, Named("address")] = None
-    """Where datagrams to it are sent. Datagrams from it are recognised by the IP address.
+    unicast: Annotated[Located[Address] | None, ENDPOINT, Named("address")] = None
+    """Where datagrams to it are sent. Datagrams from it are recognised by the IP address. The running router resolves
+    a host name, again and again.
 
     Title: Endpoint address
     Example: 192.168.0.30:8
+    Example: robot3.local:50052
     """
     group: Annotated[Located[Address] | None, GROUP] = None
     """In place of `address`: the multicast group and port that datagrams are sent to. It is no sender, and no board.
