@@ -60,6 +60,7 @@ TEST = (
 )
 UNITS = {
     "address": "IPv4 address and port",
+    "endpoint_address": "IPv4 address or host name, and port",
     "path": "path",
     "duration": "time",
     "age_limit": "time or {none: why}",
