@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 from router.assets import asset, is_installed
-from router.cli import OK, Subparsers, add_verb
-from router.errors import UsageError, shown_path
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
+from router.cli.findings import print_findings
+from router.errors import UsageError, plural, shown_path
 
 FIRST_TABLE = Path(__file__).parents[1] / "tools" / "first_table"
 
@@ -23,14 +26,21 @@ _ROVER = {
     "schemas": "schemas for editors, and its ROS messages, 'comms'; colcon builds them (docs/guides/ros-workspace.md)",
 }
 _DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
-the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run and change. If
-one of the folders already exists, nothing is written."""
+the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run and change. With
+--protos, propose a table for the messages of another robot: its envelope, and a route for each payload. If one of the
+folders already exists, nothing is written."""
+_PROTOS = "folder of another robot's .proto files, which stay where they are"
+_MESSAGE = "with --protos, the envelope (default: the likeliest message)"
+_EXAMPLES = ("router init robot", "router init --rover .", "router init robot --protos vendor/protos")
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    parser = add_verb(subparsers, "init", _DESCRIPTION, "router init robot", "router init --rover .")
+    parser = add_verb(subparsers, "init", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("folder", metavar="DIR", type=Path, help="created if it does not exist")
-    parser.add_argument("--rover", action="store_true", help="the rover's tables, protos and ROS messages")
+    parts = parser.add_mutually_exclusive_group()
+    parts.add_argument("--rover", action="store_true", help="the rover's tables, protos and ROS messages")
+    parts.add_argument("--protos", type=Path, metavar="PROTOS", help=_PROTOS)
+    parser.add_argument("--message", metavar="NAME", help=_MESSAGE)
 
 
 def _rover_parts() -> dict[str, str]:
@@ -45,6 +55,10 @@ def _rover_parts() -> dict[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.protos is not None:
+        return _propose(args)
+    if args.message is not None:
+        raise UsageError("--message is the envelope among the messages of --protos", "name their folder: --protos DIR")
     parts = _rover_parts() if args.rover else _FIRST
     targets = {part: args.folder / part for part in parts}
     try:
@@ -61,15 +75,49 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.folder} cannot be written: {error.strerror or error}") from error
     for part, target in targets.items():
         print(f"{shown_path(target)}: {parts[part]}")
-    print(_next_steps(args.folder, is_rover=args.rover))
+    print(_next_steps(args.folder, "router validate && router test", "routes/sim.yaml" if args.rover else ""))
     return OK
 
 
-def _next_steps(folder: Path, *, is_rover: bool) -> str:
-    table = " -t routes/sim.yaml" if is_rover else ""
+def _propose(args: argparse.Namespace) -> int:
+    """Write a proposed table and its lock, and check it. Raises TableError for broken `.proto` files."""
+    from router.compiler import check_table
+    from router.errors import Located, SourceSpan
+    from router.tools.proposal import candidates, table_text
+    from router.types.lock import LockComparison
+    from router.types.lock_file import write_lock
+    from router.types.protobuf import load_folder
+
+    routes = args.folder / "routes"
+    if routes.exists():
+        raise UsageError(f"{shown_path(routes)} already exists; nothing was written")
+    schema = load_folder(Located(args.protos.absolute(), SourceSpan(shown_path(args.protos))))
+    envelope, *others = candidates(schema, args.message)
+    try:
+        routes.mkdir(parents=True)
+        protos = Path(os.path.relpath(args.protos.resolve(), routes.resolve())).as_posix()
+        table = routes / "rover.yaml"
+        table.write_text(table_text(envelope, others, protos), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{args.folder} cannot be written: {error.strerror or error}") from error
+    checked = check_table(table)
+    print(f"{shown_path(table)}: {envelope.message.name}, {plural(len(envelope.cases), 'payload case')}")
+    if checked.schema is not None and checked.envelope is not None:
+        lock = LockComparison(checked.schema, checked.envelope)
+        write_lock(checked.schema.lock, lock.extended())
+        print(f"{shown_path(checked.schema.lock)}: the lock of its field numbers")
+    checked = check_table(table)
+    print_findings([*schema.warnings, *checked.diagnostics], sys.stderr)
+    print(_next_steps(args.folder, "router validate"))
+    return BAD_TABLE if checked.has_errors else OK
+
+
+def _next_steps(folder: Path, checks: str, run: str = "") -> str:
+    """Return the steps after `init`; `run` is the table to run if it is not the default one."""
+    table = f" -t {run}" if run else ""
     steps = {
         f"cd {shlex.quote(str(folder))}": "" if folder.resolve() != Path.cwd() else None,
-        "router validate && router test": "",
+        checks: "",
         f"router run{table}": "    # until Ctrl-C; prints the address of its status page",
         f"router sim{table}": "    # in another terminal: simulates the boards",
     }

@@ -250,14 +250,22 @@ def _load(
     warnings, valid = _check_others(folder, names)
     if with_others and valid:
         compiled = compile_protos(folder, [*names, *valid])
+    return _schema(folder, envelope, path, compiled, warnings)
+
+
+def _schema(
+    folder: Folder, envelope: str, lock: Path, compiled: FileDescriptorSet, warnings: Sequence[Diagnostic]
+) -> ProtoSchema:
+    """Return the declarations, with the options of boards. Raises TableError."""
     files = {file.name: file for file in compiled.file}
     _note_hidden(folder, files)
     findings = _reserved_number_findings(folder, compiled)
+    warnings = list(warnings)
     options = {}
     for name in folder.files:
         if name.endswith(OPTIONS):
             proto = proto_of(name)
-            options[proto], complaints = read_options(root / name)
+            options[proto], complaints = read_options(folder.root / name)
             if proto in files:
                 findings += complaints
                 warnings += options[proto].unused(files[proto])
@@ -265,7 +273,16 @@ def _load(
                 warnings.append(_unused(proto, complaints))
     if findings:
         raise TableError(findings)
-    return ProtoSchema(folder, envelope, path, compiled, options, warnings)
+    return ProtoSchema(folder, envelope, lock, compiled, options, warnings)
+
+
+def load_folder(protos: Located[Path]) -> ProtoSchema:
+    """Compile all valid `.proto` files below `protos`, without an envelope. Raises TableError if there is none."""
+    folder = read_folder(Path(inputs.real_path(protos.value)), protos.span)
+    warnings, valid = _check_others(folder, [])
+    if not valid:
+        raise TableError(warnings)
+    return _schema(folder, "", lock_path(protos, None), compile_protos(folder, valid), warnings)
 
 
 def _note_hidden(folder: Folder, compiled: Collection[str]) -> None:
