@@ -62,8 +62,13 @@ class Wire:
     def decode(self, datagram: bytes) -> Decoded:
         """Parse a datagram as a listener with `framing: zero_trimmed` does.
 
-        Raises DecodeError, which begins with the reason under which the router counts such a datagram.
+        Of one with several messages, return the first. Raises DecodeError, which begins with the reason under which
+        the router counts such a datagram.
         """
+        return self.decode_all(datagram)[0]
+
+    def decode_all(self, datagram: bytes) -> list[Decoded]:
+        """Like `decode`, but return all messages of the datagram."""
         if len(datagram) > MAX_DATAGRAM:
             raise DecodeError(f"truncated: {len(datagram)} bytes; the limit is {MAX_DATAGRAM}")
         whole = restored(datagram)
@@ -77,11 +82,11 @@ class Wire:
         if (other := self.envelope.unroutable.get(members[0])) is not None:
             raise DecodeError(f"unhandled: {members[0]} is {other.type}, not a message")
         try:
-            ((case, message),) = self.envelope.payloads_of(outer)
+            found = self.envelope.payloads_of(outer)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_unparsed(members[0])}") from error
-        *superseded, _ = payloads(self.envelope, whole, repairs=False)
-        return Decoded(case, message, len(whole) - len(datagram), superseded)
+        superseded = payloads(self.envelope, whole, repairs=False)[:-1] if len(found) == 1 else ()
+        return [Decoded(case, message, len(whole) - len(datagram), superseded) for case, message in found]
 
 
 def wire_of_table(table: RouteTable) -> Wire:

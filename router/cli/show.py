@@ -160,9 +160,9 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
         for entry in entries:
             last = entry.at
             if span is None or span[0] <= entry.at <= span[1]:
-                as_shown = shown(entry.action if isinstance(entry, RecordedAction) else entry, wire)
-                if chosen.takes(as_shown, entry.at):
-                    yield as_shown.json(False) if args.json else as_shown.line(False)
+                for each in shown(entry.action if isinstance(entry, RecordedAction) else entry, wire):
+                    if chosen.takes(each, entry.at):
+                        yield each.json(False) if args.json else each.line(False)
 
     printed = lines()
     while batch := [*islice(printed, _BATCH)]:
@@ -194,8 +194,8 @@ def _explain(
             print("\n".join(([""] if number else []) + stop.lines()))
     for silence in stops.silences:
         if span is None or span[0] <= silence.at <= span[1]:
-            as_shown = shown(silence, wire)
-            print(as_shown.json(False) if args.json else as_shown.line(False))
+            for each in shown(silence, wire):
+                print(each.json(False) if args.json else each.line(False))
     if not chosen and span is not None:
         _say_nothing(span, "no deadman tripped", last)
     elif not chosen and not stops.has_actions:

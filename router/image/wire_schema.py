@@ -9,7 +9,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from router import declared as c
 from router.compiler.lowering.arrays import Arrays
 from router.declared import CaseBy, WireFlag, WireKind
-from router.types.case_by import ByName, ByOneof
+from router.types.case_by import ByCases, ByName, ByOneof
 from router.types.descriptors import message_of
 from router.types.protobuf import Envelope, MessageClass, PayloadCase
 from router.types.undecidable import all_fields, all_types
@@ -35,7 +35,7 @@ def write_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> 
     choice, roots = envelope.choice, [_descriptor(envelope.message_class)]
     flags: dict[int, int] = {}
     held: list[PayloadCase] = []
-    if isinstance(choice, ByOneof):
+    if isinstance(choice, (ByOneof, ByCases)):
         flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
     elif isinstance(choice, ByName):
         held = [case for case in envelope.cases.values() if case.number in routed]

@@ -313,13 +313,12 @@ class FoxgloveServer:
     def _send(self, batch: Sequence[Mirrored]) -> None:
         """Send the accepted payloads of subscribed channels. Called by the mirror."""
         program, classifier, channels = self._view
-        number_of = program.envelope.choice.first_number
+        numbers_in = program.envelope.choice.numbers_in
         messages = []
         for at, listener, _, _, reason, data in batch:
-            if reason or channels.get(number_of(data, channels)) not in self._wanted:
+            if reason or self._wanted.isdisjoint(map(channels.get, numbers_in(data, channels))):
                 continue
-            if (found := classifier.encoded_payload(listener, data)) is not None:
-                case, payload = found
+            for case, payload in classifier.encoded_payloads(listener, data):
                 messages.append(_Message(channels[case.number], at, payload))
         self._arrived.extend(messages)
         if messages and not self._is_showing:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from time import monotonic
 from typing import Any
 
@@ -55,7 +56,7 @@ class LastValues:
             with self._newest_lock:
                 newest, self._newest = self._newest, {}
             classifier = Classifier(program.envelope, program.table)
-            for at, datagram in newest.values():
+            for at, datagram in sorted(newest.values(), key=itemgetter(0)):  # a datagram may have several values
                 self._decode(at, datagram, classifier)
             return dict(self._values)
 
@@ -72,20 +73,19 @@ class LastValues:
             for datagram in batch:
                 *_, reason, data = datagram
                 if not reason:
-                    self._newest[envelope.choice.first_number(data, numbers)] = now, datagram
+                    for number in envelope.choice.numbers_in(data, numbers) or (0,):
+                        self._newest[number] = now, datagram
 
     def _decode(self, at: int, datagram: Mirrored, classifier: Classifier) -> None:
         _, listener, peer, endpoint, _, data = datagram
-        if (found := classifier.payload(listener, data)) is None:
-            return  # a reload has changed the messages meanwhile
-        case, payload = found
-        fields = protobuf_json(payload, complete=True)
-        self._values[case.name] = {
-            "at": at / 1e9,
-            "source": endpoint or f"{peer[0]}:{peer[1]}",
-            "bytes": len(data),
-            "fields": shortened(fields),
-        }
+        for case, payload in classifier.payloads(listener, data):  # none if a reload has changed the messages meanwhile
+            fields = protobuf_json(payload, complete=True)
+            self._values[case.name] = {
+                "at": at / 1e9,
+                "source": endpoint or f"{peer[0]}:{peer[1]}",
+                "bytes": len(data),
+                "fields": shortened(fields),
+            }
 
     def _end_when_idle(self) -> None:
         while not self._closing.wait(max(0.0, self._until - monotonic())):

@@ -86,12 +86,13 @@ def _of_case(program: CompiledTable, cases: Sequence[str]) -> Wanted:
     known = program.envelope.cases
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
-    number_of, numbers = program.envelope.choice.first_number, frozenset(program.envelope.numbers.values())
+    numbers_in, numbers = program.envelope.choice.numbers_in, frozenset(program.envelope.numbers.values())
     unwanted = numbers - {known[name].number for name in cases}
 
     def is_wanted(datagram: Mirrored) -> bool:
         *_, data = datagram
-        return number_of(data, numbers) not in unwanted
+        found = numbers_in(data, numbers)
+        return not found or not unwanted.issuperset(found)
 
     return is_wanted
 

@@ -175,11 +175,10 @@ class Encoder:
     def _raw(
         self, classifier: Classifier, listener: str, peer: Peer, endpoint: str, reason: str, data: bytes
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield channel and message of a datagram, and of its payload if there is one."""
+        """Yield channel and message of a datagram, and of its payloads."""
         datagram = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=endpoint)
         yield self._channels.datagrams(reason), datagram.SerializeToString()
-        if (encoded := classifier.encoded_payload(listener, data)) is not None:
-            case, payload = encoded
+        for case, payload in classifier.encoded_payloads(listener, data):
             yield self._channels.view(case, reason), payload
 
     def _action(self, classifier: Classifier, action: Action) -> tuple[int, bytes]:

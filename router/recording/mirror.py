@@ -276,25 +276,22 @@ class Classifier:
         """The case of an envelope that is itself the payload."""
         self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
 
-    def payload(self, listener: str, data: bytes) -> tuple[PayloadCase, Message] | None:
-        """Return the payload case and the payload, or None for a datagram that the listener rejects."""
+    def payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, Message]]:
+        """Return the payloads with their cases; none for a datagram that the listener rejects."""
         if len(data) > MAX_DATAGRAM or not self.envelope.cases:
-            return None
+            return []
         if listener in self._trimming:
             data = restored(data)
         try:
-            return next(iter(self.envelope.payloads_of(self.envelope.message_class.FromString(data))), None)
+            return self.envelope.payloads_of(self.envelope.message_class.FromString(data))
         except ProtobufError:
-            return None
+            return []
 
-    def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
-        """Like `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
+    def encoded_payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, bytes]]:
+        """Like `payloads`, but return their bytes; much faster for a frame with zeros removed or added."""
         if listener in self._trimming and (field := self._single_field(data)) is not None:
-            return field
-        if (decoded := self.payload(listener, data)) is None:
-            return None
-        case, payload = decoded
-        return case, payload.SerializePartialToString()
+            return [field]
+        return [(case, payload.SerializePartialToString()) for case, payload in self.payloads(listener, data)]
 
     def sent_payload(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload of a datagram that the router has sent, perhaps without trailing zeros."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from router.declared import ONLY_CASE
-from router.types.case_by import ByFrame, ByName, ByOneof, Choice, Wrapping
+from router.types.case_by import ByCases, ByFrame, ByName, ByOneof, Choice, Wrapping
 from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types
 from router.types.wire import LEN, read_varint
@@ -37,7 +37,7 @@ def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
     """Return how an envelope holds the payloads of a channel, from its metadata."""
     number = int(metadata["number"])
     before, after = (bytes.fromhex(metadata.get(key, "")) for key in ("before", "after"))
-    return Wrapping(number << 3 | LEN if number else 0, before, after)
+    return Wrapping(number << 3 | LEN if number else 0, before, after, is_shared="shared" in metadata)
 
 
 def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
@@ -58,7 +58,7 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
     message = own.message_type.add(name="Recorded")
     inside = sorted((case for case in known.values() if case.around.is_alone), key=lambda case: case.around.tag)
     named = [case for case in known.values() if case.around.tag and not case.around.is_alone]
-    choice: Choice = ByOneof(_ONEOF)
+    choice: Choice
     if frame := next((case for case in known.values() if not case.around.tag), None):
         only = made(frame, ONLY_CASE)
         return Envelope(frame.message, ByFrame(frame.name), only.message_class, {only.name: only}, 0)
@@ -71,20 +71,26 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
             message.field.add(name=name, number=number, type=kind, label=_OPTIONAL)
     else:
         payload_cases = [made(case, case.around.tag >> 3) for case in inside]
-        if inside:  # protobuf refuses an empty oneof
-            message.oneof_decl.add(name=_ONEOF)
-        for each in payload_cases:
-            message.field.add(
-                name=each.name,
-                number=each.number,
-                type=FieldDescriptorProto.TYPE_MESSAGE,
-                label=_OPTIONAL,
-                type_name=f".{each.type.name}",
-                oneof_index=0,
-            )
+        choice = _add_fields(message, payload_cases, is_shared=any(case.around.is_shared for case in inside))
     pool.AddSerializedFile(own.SerializeToString())
     by_name = {case.name: case for case in payload_cases}
     return Envelope(_NAME, choice, GetMessageClass(pool.FindMessageTypeByName(_NAME)), by_name, 0)
+
+
+def _add_fields(message: DescriptorProto, cases: Sequence[PayloadCase], *, is_shared: bool) -> Choice:
+    """Add a field for each case: to a oneof, unless a frame may hold several."""
+    if cases and not is_shared:  # protobuf refuses an empty oneof
+        message.oneof_decl.add(name=_ONEOF)
+    for each in cases:
+        message.field.add(
+            name=each.name,
+            number=each.number,
+            type=FieldDescriptorProto.TYPE_MESSAGE,
+            label=_OPTIONAL,
+            type_name=f".{each.type.name}",
+            oneof_index=None if is_shared else 0,
+        )
+    return ByCases([each.name for each in cases]) if is_shared else ByOneof(_ONEOF)
 
 
 def _name_of(around: Wrapping) -> tuple[int, str]:

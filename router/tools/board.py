@@ -282,10 +282,14 @@ class Inbox:
 
     def take(self, now: float, datagram: bytes) -> None:
         try:
-            decoded = self._wire.decode(datagram)
+            found = self._wire.decode_all(datagram)
         except DecodeError:
             self.undecodable += 1
             return
+        for decoded in found:
+            self._take(now, decoded)
+
+    def _take(self, now: float, decoded: Decoded) -> None:
         case, message = decoded.case, decoded.message
         arrivals = self.arrivals.get(case.name)
         if arrivals is None:

@@ -313,7 +313,7 @@ class Stops:
         return Fed(it.at, decoded.case.name, compact(decoded.message, decoded.case.type), sender)
 
     def _case_of(self, data: bytes) -> str:
-        return self._names.get(self._wire.envelope.choice.first_number(data, self._names), "")
+        return next((self._names[number] for number in self._wire.envelope.choice.numbers_in(data, self._names)), "")
 
     def _sender(self, route: str) -> str:
         """Return who sent the last command that the route accepted; "" if that is not in the recording."""

@@ -275,7 +275,7 @@ class RunningTap:
             self.missed += sum(item.number for item in batch if isinstance(item, Lost))
             mirrored = [item for item in batch if not isinstance(item, Lost)]
             mirrored.sort(key=lambda item: item.at)  # actions come apart from datagrams
-            items = [(shown(item, self._wire), item.at) for item in mirrored]
+            items = [(each, item.at) for item in mirrored for each in shown(item, self._wire)]
             yield [item for item, at in items if self._filter.takes(item, at)]
 
 
@@ -299,23 +299,24 @@ def listen(
         except TimeoutError:
             yield []
         else:
-            yield [tapped_datagram(wall_ns(), name_of(peer), data, wire)]
+            yield tapped_datagram(wall_ns(), name_of(peer), data, wire)
 
 
-def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> TappedDatagram:
-    """Return a datagram that was received at `at`, ns since 1970."""
+def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> list[TappedDatagram]:
+    """Return a datagram that was received at `at`, ns since 1970, once for each of its messages."""
     try:
-        return TappedDatagram(local_time(at), peer, data, wire.decode(data), rejected=rejected)
+        found = wire.decode_all(data)
     except DecodeError as error:
-        return TappedDatagram(local_time(at), peer, data, None, str(error), rejected)
+        return [TappedDatagram(local_time(at), peer, data, None, str(error), rejected)]
+    return [TappedDatagram(local_time(at), peer, data, decoded, rejected=rejected) for decoded in found]
 
 
-def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> TappedDatagram | ShownAction:
-    """Return a datagram or an action as it is printed."""
+def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> Sequence[TappedDatagram | ShownAction]:
+    """Return each message of a datagram, or an action, as it is printed."""
     if not isinstance(it, Action):
         return tapped_datagram(it.at, it.endpoint or f"{it.peer[0]}:{it.peer[1]}", it.data, wire, it.reason)
     try:
         decoded = wire.decode(it.data) if it.what in (SENT, BRAKED) and it.data else None
     except DecodeError:
         decoded = None
-    return ShownAction(local_time(it.at), it, decoded)
+    return [ShownAction(local_time(it.at), it, decoded)]

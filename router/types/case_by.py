@@ -5,9 +5,9 @@ A frame is a datagram with its trailing zeros restored. The fields of the classe
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, islice
 from typing import TYPE_CHECKING, ClassVar, Union
 
 from google.protobuf.empty_pb2 import Empty
@@ -27,13 +27,14 @@ class Wrapping:
     """How an envelope holds a payload: in the field with this tag; with 0 the frame is the payload.
 
     `before` and `after` are the field with the name of the message. `is_optional`: the field of an empty payload is
-    left out.
+    left out. `is_shared`: a frame may hold other payloads, too.
     """
 
     tag: int
     before: bytes = b""
     after: bytes = b""
     is_optional: bool = False
+    is_shared: bool = False
 
     @property
     def is_alone(self) -> bool:
@@ -53,26 +54,14 @@ def named(name: int, text: str, payload: int, *, is_optional: bool) -> Wrapping:
     return Wrapping(tag, *around, is_optional=is_optional)
 
 
-@dataclass(frozen=True, slots=True)
-class ByOneof:
-    """Each member of a oneof is a case."""
+class _ByField:
+    """Some fields of the envelope are cases."""
 
-    oneof: str
-    kind: ClassVar[str] = "oneof"
-    """The name in `enum case_by`."""
-    by: ClassVar[str] = BY_ONEOF
-    """What the lock file says about it."""
-    root: ClassVar[str] = ""
-    """The case that the envelope itself is, "" if it only holds them."""
+    __slots__ = ()
 
     def place(self, envelope: str, case: PayloadCase) -> str:
         """Describe where an envelope, by name, holds a payload."""
         return f"field {case.number} of {envelope}"
-
-    def members_of(self, frame: Message) -> Sequence[str]:
-        """Return the names of the cases that a parsed frame holds, even of those that no route can take."""
-        name = frame.WhichOneof(self.oneof)
-        return [str(name)] if name is not None else []
 
     def payload(self, frame: Message, case: PayloadCase) -> Message:
         """Return a case that a parsed frame holds. Raises protobuf's DecodeError."""
@@ -102,21 +91,59 @@ class ByOneof:
         found = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
         return [name for name, _ in groupby(names[member] for member in found if member in names)]
 
-    def first_number(self, datagram: bytes, numbers: Container[int]) -> int:
-        """Return the first of the cases with these `numbers` in a datagram, 0 if there is none.
-
-        It is found without parsing the datagram, which may be malformed, trimmed or padded.
-        """
+    def _numbers(self, datagram: bytes, numbers: Container[int]) -> Iterator[int]:
+        """Yield the number of each field that is one of the cases with these `numbers`."""
         position = 0
         try:
             while position < len(datagram):
                 tag, position = read_varint(datagram, position)
                 if tag >> 3 in numbers:
-                    return tag >> 3
+                    yield tag >> 3
                 position = _after(datagram, position, tag & 7)
         except IndexError:
             pass  # it ends early: zeros were trimmed, or it is malformed
-        return 0
+
+
+@dataclass(frozen=True, slots=True)
+class ByOneof(_ByField):
+    """Each member of a oneof is a case."""
+
+    oneof: str
+    kind: ClassVar[str] = "oneof"
+    """The name in `enum case_by`."""
+    by: ClassVar[str] = BY_ONEOF
+    """What the lock file says about it."""
+    root: ClassVar[str] = ""
+    """The case that the envelope itself is, "" if it only holds them."""
+
+    def members_of(self, frame: Message) -> Sequence[str]:
+        """Return the names of the cases that a parsed frame holds, even of those that no route can take."""
+        name = frame.WhichOneof(self.oneof)
+        return [str(name)] if name is not None else []
+
+    def numbers_in(self, datagram: bytes, numbers: Container[int]) -> Sequence[int]:
+        """Return the cases with these `numbers` that a datagram seems to hold; of a oneof, the first member.
+
+        They are found without parsing the datagram, which may be malformed, trimmed or padded.
+        """
+        return [*islice(self._numbers(datagram, numbers), 1)]
+
+
+@dataclass(frozen=True, slots=True)
+class ByCases(_ByField):
+    """Each of these fields that is present is a message. They are in the order of their numbers."""
+
+    cases: Sequence[str]
+    kind: ClassVar[str] = "cases"
+    by: ClassVar[str] = "cases"
+    oneof: ClassVar[str] = ""
+    root: ClassVar[str] = ""
+
+    def members_of(self, frame: Message) -> Sequence[str]:
+        return [name for name in self.cases if frame.HasField(name)]
+
+    def numbers_in(self, datagram: bytes, numbers: Container[int]) -> Sequence[int]:
+        return [*dict.fromkeys(self._numbers(datagram, numbers))]
 
 
 def _unknown_fields(frame: Message) -> list[int]:
@@ -165,8 +192,8 @@ class ByFrame:
     def all_members(self, envelope: Envelope, frame: bytes) -> Sequence[str]:
         return [self.case]
 
-    def first_number(self, datagram: bytes, numbers: Container[int]) -> int:
-        return ONLY_CASE
+    def numbers_in(self, datagram: bytes, numbers: Container[int]) -> Sequence[int]:
+        return [ONLY_CASE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +253,7 @@ class ByName:
         texts += texts[-1:] * (payloads - len(texts))
         return [self.cases[text][0] if text in self.cases else text for text in texts]
 
-    def first_number(self, datagram: bytes, numbers: Container[int]) -> int:
+    def numbers_in(self, datagram: bytes, numbers: Container[int]) -> Sequence[int]:
         text, position = b"", 0
         try:
             while position < len(datagram):
@@ -237,7 +264,7 @@ class ByName:
         except IndexError:
             pass  # as above
         _, number = self.cases.get(text.decode(errors="replace"), ("", 0))
-        return number if number in numbers else 0
+        return [number] if number in numbers else []
 
 
 def _alike(name: str, known: Iterable[str]) -> str:
@@ -250,4 +277,4 @@ def _bare(name: str) -> str:
     return name.rpartition("/")[2].rpartition(".")[2].lower()
 
 
-Choice = Union[ByOneof, ByFrame, ByName]
+Choice = Union[ByOneof, ByCases, ByFrame, ByName]

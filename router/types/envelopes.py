@@ -2,33 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.declared import ONLY_CASE
 from router.errors import Code, Located, TableError, did_you_mean
 from router.types.boards import largest_encoding, largest_fields
-from router.types.case_by import ByFrame, ByName, Wrapping, named
+from router.types.case_by import ByCases, ByFrame, ByName, Wrapping, named
 from router.types.model import MessageType
 from router.types.proto_files import ANY
-from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, payload_case
 from router.types.undecidable import undecidable
+from router.types.wire import LEN
 
 ANY_PREFIX = "type.googleapis.com/"
 """What protobuf puts before the full name of a message in its own envelope."""
 
 
-def chosen_envelope(schema: ProtoSchema, choice: Mapping[str, Located[str]]) -> Envelope:
+def chosen_envelope(schema: ProtoSchema, choice: Mapping[str, Sequence[Located[str]]]) -> Envelope:
     """Return the envelope of the schema. `choice` are the keys of the table that say how it holds payloads.
 
     Raises TableError.
     """
-    if "oneof" in choice:
-        return find_envelope(schema, choice["oneof"])
-    if "payload" in choice:
-        return named_envelope(schema, choice["case"], choice["payload"])
-    return framed_envelope(schema, choice["case"])
+    if "cases" in choice:
+        return shared_envelope(schema, choice["cases"])
+    names = {key: name for key, (name,) in choice.items()}
+    if "oneof" in names:
+        return find_envelope(schema, names["oneof"])
+    if "payload" in names:
+        return named_envelope(schema, names["case"], names["payload"])
+    return framed_envelope(schema, names["case"])
+
+
+def shared_envelope(schema: ProtoSchema, names: Sequence[Located[str]]) -> Envelope:
+    """Return an envelope of which each of these fields that is present is a message. Raises TableError."""
+    envelope = schema.descriptor(schema.envelope)
+    fields = sorted({_field(schema, envelope, name, _is_message, "a message type") for name in names}, key=_number)
+    if refused := list(undecidable([envelope], (), schema.place)):
+        raise TableError(refused)
+    cases = {field.name: replace(payload_case(schema, field), wrapped=_shared(field)) for field in fields}
+    beside = tuple(member for member in schema.messages[envelope.full_name].fields if member.name not in cases)
+    return Envelope(
+        envelope.full_name,
+        ByCases([*cases]),
+        schema.message_class(envelope.full_name),
+        cases,
+        largest_fields(envelope.fields, schema.board_options),
+        beside=MessageType(envelope.full_name, beside),
+    )
+
+
+def _is_message(field: FieldDescriptor) -> bool:
+    return field.type == FieldDescriptor.TYPE_MESSAGE and not field.is_required
+
+
+def _number(field: FieldDescriptor) -> int:
+    return field.number
+
+
+def _shared(field: FieldDescriptor) -> Wrapping:
+    return Wrapping(field.number << 3 | LEN, is_shared=True)
 
 
 def framed_envelope(schema: ProtoSchema, name: Located[str]) -> Envelope:
@@ -48,8 +83,8 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
     Each message of the compiled files is a case. Raises TableError.
     """
     envelope = schema.descriptor(schema.envelope)
-    of_name = _field(schema, envelope, name, FieldDescriptor.TYPE_STRING, "string")
-    of_payload = _field(schema, envelope, payload, FieldDescriptor.TYPE_BYTES, "bytes")
+    of_name = _field(schema, envelope, name, _is_text, "type string")
+    of_payload = _field(schema, envelope, payload, _is_bytes, "type bytes")
     messages = sorted(_messages(schema), key=lambda message: message.full_name.encode())
     if refused := list(undecidable([envelope, *messages], (), schema.place)):
         raise TableError(refused)
@@ -85,15 +120,29 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
     )
 
 
-def _field(schema: ProtoSchema, envelope: Descriptor, name: Located[str], kind: int, text: str) -> FieldDescriptor:
+def _is_text(field: FieldDescriptor) -> bool:
+    return field.type == FieldDescriptor.TYPE_STRING
+
+
+def _is_bytes(field: FieldDescriptor) -> bool:
+    return field.type == FieldDescriptor.TYPE_BYTES
+
+
+def _field(
+    schema: ProtoSchema,
+    envelope: Descriptor,
+    name: Located[str],
+    has_kind: Callable[[FieldDescriptor], bool],
+    kind: str,
+) -> FieldDescriptor:
     """Return a field of the envelope. Raises TableError if it does not exist, or has another type."""
     field = envelope.fields_by_name.get(name.value)
-    fits = [each.name for each in envelope.fields if each.type == kind and not each.is_repeated and not _excludes(each)]
+    fits = [each.name for each in envelope.fields if has_kind(each) and not each.is_repeated and not _excludes(each)]
     if field is None:
         what = f"{envelope.full_name} has no field '{name.value}'"
         raise TableError.of(name.span, Code.BAD_VALUE, what, did_you_mean(name.value, fits))
     if field.name not in fits:
-        what = f"'{name.value}' of {envelope.full_name} must be a single field of type {text}, not in a oneof"
+        what = f"'{name.value}' of {envelope.full_name} must be a single field of {kind}, not in a oneof"
         raise TableError.of(name.span, Code.BAD_VALUE, what, f"see {schema.place(field.full_name)}")
     return field
 

@@ -401,7 +401,7 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
         raise TableError(refused)
     messages = [field for field in oneof.fields if field.type == FieldDescriptor.TYPE_MESSAGE]
     others = [field for field in oneof.fields if field.type != FieldDescriptor.TYPE_MESSAGE]
-    cases = {field.name: _payload_case(schema, field) for field in messages}
+    cases = {field.name: payload_case(schema, field) for field in messages}
     options = {field.name: schema.board_options(field) for field in oneof.fields}
     # An unbounded case is only reported if it is sent to a board.
     bounded = [
@@ -436,7 +436,8 @@ def _oneofs(message: Descriptor) -> list[str]:
     return [name for name, oneof in message.oneofs_by_name.items() if name != f"_{oneof.fields[0].name}"]
 
 
-def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
+def payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
+    """Return the case that a field of the envelope is."""
     message = message_of(field)
     size = largest_encoding(message, schema.board_options)
     return PayloadCase(field.name, field.number, schema.messages[message.full_name], GetMessageClass(message), size)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
 from pathlib import Path
 
 from router.carrier.build import build, is_current
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import REJECT_REASONS
-from router.declared import MAX_DATAGRAM, Envelope
+from router.declared import MAX_DATAGRAM, Bytes, Envelope
 from router.image.wire_schema import write_schema
 from router.library import load
 from tests.carrier.delivering import Payload
@@ -36,6 +37,11 @@ SCHEMAS = {
     "rover": (PROTOS, ONEOF, ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
     "every_kind": (TESTS / "protos", ONEOF, ["every_kind"]),
     "hard": (HARD, ONEOF, ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
+    "cases": (
+        HARD,
+        "message: Packet, cases: [nothing, tree, texts, old, unrouted]",
+        ["nothing", "tree", "texts", "old"],
+    ),
     "frame": (HARD, "message: PBEnvelope, case: frame", ["frame"]),
     "name": (HARD, "message: Wrapped, case: name, payload: data", ["Nothing", "Tree", "Texts", "Scalars", "Maps"]),
 }
@@ -66,6 +72,7 @@ class CarrierSide:
         self._schema = write_schema(made.envelope, made.inbound, self._memory)
         self._read = library.envelope_read
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
+        self._part = library.envelope_part
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
         self._envelope = Envelope()
 
@@ -75,11 +82,21 @@ class CarrierSide:
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
         schema, envelope = self._schema, self._envelope
         code = self._read(ctypes.byref(schema), self._buffer, len(data), repairs, ctypes.byref(envelope))
-        return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired, envelope.superseded)
+        return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired, envelope.others)
 
     def whole(self) -> bytes:
         """The envelope read last, restored."""
         return self._buffer.raw[: self._envelope.size]
+
+    def parts(self) -> Iterator[tuple[int, bytes]]:
+        """The messages of the envelope read last: number and frame of each."""
+        frame, room = self.whole(), (ctypes.c_char * MAX_DATAGRAM)()
+        data = ctypes.create_string_buffer(frame, len(frame))  # of its own length, for the sanitizer
+        begin = ctypes.addressof(data)
+        envelope = Envelope()
+        given = ctypes.byref(self._schema), Bytes(at=begin, end=begin + len(frame))
+        while self._part(*given, envelope.case_number, room, ctypes.byref(envelope)):
+            yield envelope.case_number, room.raw[: envelope.size]
 
     def payload(self) -> Payload:
         """The position of the payload read last."""

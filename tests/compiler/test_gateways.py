@@ -462,4 +462,4 @@ def test_a_reload_reads_no_protos_for_it_and_those_of_the_next_table(tmp_path: P
 def test_a_datagram_from_before_the_reload_has_no_payload(tmp_path: Path) -> None:
     program = check_file(tmp_path, ONLY).program
     assert program is not None
-    assert Classifier(program.envelope, program.table).payload("rover", b"\xca\x01\x02\x08\x01") is None
+    assert Classifier(program.envelope, program.table).payloads("rover", b"\xca\x01\x02\x08\x01") == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -10,7 +10,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from router.types.case_by import ByFrame, ByName, ByOneof
+from router.types.case_by import ByCases, ByFrame, ByName
 from router.types.framing import restored
 from router.types.protobuf import Envelope
 from router.types.wire import LEN
@@ -39,7 +39,7 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
     try:
         parsed: Message = envelope.message_class.FromString(whole)
     except DecodeError:
-        number = None if not isinstance(envelope.choice, ByOneof) else _only_payload(envelope, routed, data)
+        number = None if isinstance(envelope.choice, (ByFrame, ByName)) else _only_payload(envelope, routed, data)
         return Decision(None, number, False) if number else Decision("malformed", 0, False)
     is_repaired = len(whole) != len(data)
     if isinstance(envelope.choice, ByFrame):
@@ -48,8 +48,13 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
         return Decision("empty", 0, False)
     if isinstance(envelope.choice, ByName):
         return _decide_by_name(envelope, envelope.choice, routed, parsed, whole, is_repaired)
-    if name := parsed.WhichOneof(envelope.choice.oneof):
-        return Decision(None, envelope.numbers[name], is_repaired, _superseded(envelope, whole))
+    if isinstance(envelope.choice, ByCases):
+        present = any(parsed.HasField(name) for name in envelope.cases)
+    else:
+        present = parsed.WhichOneof(envelope.choice.oneof) is not None
+    if present:
+        members = _members(envelope, whole)
+        return Decision(None, members[-1], is_repaired, len(members) - 1)
     fields = UnknownFieldSet(parsed)
     unknown = [fields[index].field_number for index in range(len(fields))]
     if not unknown:
@@ -84,13 +89,45 @@ def _decide_by_name(
     return Decision(None, case.number, is_repaired, max(names, payloads) - 1)
 
 
-def _superseded(envelope: Envelope, whole: bytes) -> int:
+def parts(envelope: Envelope, whole: bytes) -> list[tuple[int, bytes]]:
+    """Number and frame of each message that a frame holds, in order, of an envelope by cases."""
+    fields = [*_fields(whole)]
+    cases = {case.number for case in envelope.cases.values()}
+    held = sorted({number for number, wire_type, _ in fields if number in cases and wire_type == LEN})
+    frames = {
+        kept: b"".join(data for number, kind, data in fields if number not in cases or kind != LEN or number == kept)
+        for kept in held
+    }
+    for kept, frame in frames.items():
+        expected = envelope.message_class.FromString(whole)
+        for case in envelope.cases.values():
+            if case.number != kept:
+                expected.ClearField(case.name)
+        found = envelope.message_class.FromString(frame)
+        assert found.SerializePartialToString() == expected.SerializePartialToString()
+    return [*frames.items()]
+
+
+def _fields(whole: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Number, wire type and encoding of each field: what protobuf makes of ever more bytes says where a field ends."""
+    begin = 0
+    for end in range(1, len(whole) + 1):
+        try:
+            fields = UnknownFieldSet(Empty.FromString(whole[begin:end]))
+        except DecodeError:
+            continue
+        yield fields[0].field_number, fields[0].wire_type, whole[begin:end]
+        begin = end
+
+
+def _members(envelope: Envelope, whole: bytes) -> list[int]:
+    """The payloads in a frame by number, pieces of one counted once."""
     members = {(case.number, LEN) for case in envelope.cases.values()}
     members |= {(member.number, member.wire_type) for member in envelope.unroutable.values()}
     fields = UnknownFieldSet(Empty.FromString(whole))
     found = [(fields[index].field_number, fields[index].wire_type) for index in range(len(fields))]
     payloads = [member for member in found if member in members]
-    return len(list(groupby(payloads))) - 1
+    return [number for (number, _), _ in groupby(payloads)]
 
 
 def _only_payload(envelope: Envelope, routed: Container[int], data: bytes) -> int | None:

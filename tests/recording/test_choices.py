@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from router.compiler import check_table
 from router.compiler.compiled_table import CompiledTable
@@ -28,13 +29,16 @@ NAMED = [
 ]
 
 
+SHARED = [b"\x12\x02\x08\x05", b"\x3a\x02\x08\x09\x18\x03\x12\x04\x08\x05\x12\x00", b"\x3a\x00\x12", b"\x3a\x00\x12\x00\0\0"]
+
+
 def program(table: str) -> CompiledTable:
     made = check_table(TABLES / table, {}).program
     assert made is not None
     return made
 
 
-@pytest.mark.parametrize(("table", "datagrams"), [("framed.yaml", FRAMED), ("named.yaml", NAMED)])
+@pytest.mark.parametrize(("table", "datagrams"), [("framed.yaml", FRAMED), ("named.yaml", NAMED), ("vision.yaml", SHARED)])
 def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tmp_path: Path) -> None:
     made = program(table)
     batch = [shown(data, START + number) for number, data in enumerate(datagrams)]
@@ -49,6 +53,17 @@ def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tm
     assert [record.action.data for record in records if isinstance(record, RecordedAction)] == [datagrams[0]]
     own = Wire(made.envelope)
     for data in datagrams:
-        now, before = found.decode(data), own.decode(data)
-        assert now.case.name == before.case.name
-        assert now.message.SerializeToString() == before.message.SerializeToString()
+        for now, before in zip(found.decode_all(data), own.decode_all(data), strict=True):
+            assert now.case.name == before.case.name
+            assert now.message.SerializeToString() == before.message.SerializeToString()
+
+
+def test_viewers_get_each_message_of_a_datagram(tmp_path: Path) -> None:
+    made = program("vision.yaml")
+    classifier = Classifier(made.envelope, made.table)
+    packed = Packer().pack(Listed([shown(SHARED[1], START)]), Listed(list[Action]()), classifier, START, 0)
+    path = write(tmp_path / "it.mcap", Channels(), packed)
+    with path.open("rb") as file:
+        found = {channel.topic: message.data for _, channel, message in make_reader(file).iter_messages()}
+    assert found["geometry"] == b"\x08\x09"
+    assert found["detection"] == b"\x08\x05\x12\x00"

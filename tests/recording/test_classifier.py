@@ -10,7 +10,7 @@ from hypothesis import given
 from router.compiler import check_table
 from router.declared import MAX_DATAGRAM
 from router.recording.mirror import Classifier
-from router.types.case_by import ByOneof
+from router.types.case_by import ByCases, ByOneof
 from router.types.protobuf import PayloadCase
 from tests.envelopes import I32, I64, LEN, VARINT, framed, tag
 from tests.observe.fake_running import sim_program
@@ -25,39 +25,43 @@ BRAKE = PROGRAM.envelope.message_class(manual_brake={"brake": True}).SerializeTo
 
 
 def case_in(data: bytes, known: Classifier = KNOWN, listener: str = "rover") -> str | None:
-    found = known.payload(listener, data)
-    return found[0].name if found is not None else None
+    found = known.payloads(listener, data)
+    return found[0][0].name if found else None
 
 
 @pytest.mark.parametrize("case", PROGRAM.envelope.cases.values(), ids=lambda case: case.name)
 def test_the_case_is_found_without_parsing(case: PayloadCase) -> None:
     data = PROGRAM.envelope.message_class(**{case.name: {}}).SerializeToString()
-    assert ByOneof("payload").first_number(data, NUMBERS) == case.number
-    assert KNOWN.payload("rover", data) == (case, case.message_class())
+    assert ByOneof("payload").numbers_in(data, NUMBERS) == [case.number]
+    assert KNOWN.payloads("rover", data) == [(case, case.message_class())]
 
 
 @pytest.mark.parametrize("data", [b"", b"\x80", b"\xff\xff\xff"])
 def test_what_begins_with_no_tag_has_no_payload(data: bytes) -> None:
-    assert ByOneof("payload").first_number(data, NUMBERS) == 0
+    assert ByOneof("payload").numbers_in(data, NUMBERS) == []
     assert case_in(data) is None
 
 
 @pytest.mark.parametrize("before", [b"", *(tag(20, kind) + value for kind, value in VALUES.items())])
 def test_a_payload_is_found_behind_other_fields_of_the_envelope(before: bytes) -> None:
     for number in (1, 16, 2047, 2048, 2**29 - 1):
-        assert ByOneof("payload").first_number(before + framed(number, b"x"), {number}) == number
-    assert ByOneof("payload").first_number(before + framed(17, b"x"), {16}) == 0
+        assert ByOneof("payload").numbers_in(before + framed(number, b"x"), {number}) == [number]
+    assert ByOneof("payload").numbers_in(before + framed(17, b"x"), {16}) == []
+
+
+def test_each_case_of_a_datagram_is_found_once() -> None:
+    data = framed(16, b"x") + tag(3, VARINT) + b"\1" + framed(2, b"") + framed(16, b"")
+    assert ByCases(["two", "sixteen"]).numbers_in(data, {2, 16}) == [16, 2]
+    assert ByCases(["two", "sixteen"]).numbers_in(data[:4], {2}) == []
 
 
 @given(datagrams())
 def test_an_encoded_payload_is_the_payload(data: bytes) -> None:
     known = classifier()
-    decoded, encoded = known.payload("rover", data), known.encoded_payload("rover", data)
-    assert (decoded is None) == (encoded is None)
-    if decoded is not None and encoded is not None:
-        case, payload = encoded
-        assert case is decoded[0]
-        assert case.message_class.FromString(payload).SerializeToString() == decoded[1].SerializeToString()
+    decoded, encoded = known.payloads("rover", data), known.encoded_payloads("rover", data)
+    assert [case.name for case, _ in encoded] == [case.name for case, _ in decoded]
+    for (case, payload), (_, message) in zip(encoded, decoded, strict=True):
+        assert case.message_class.FromString(payload).SerializeToString() == message.SerializeToString()
 
 
 def test_what_is_longer_than_the_router_takes_has_no_payload() -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import socket
+from pathlib import Path
 
 import pytest
 
+from router.compiler import check_table
 from router.datagrams import Wire
 from router.errors import UsageError
 from router.observe.tap import Lost
@@ -17,6 +19,8 @@ from router.tools.udp import open_udp
 from router.values.reading import payload
 from tests.observe.fake_running import sim_program
 
+TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
+
 
 def datagram(wire: Wire, *words: str) -> bytes:
     case = wire.case("every_kind")
@@ -24,25 +28,36 @@ def datagram(wire: Wire, *words: str) -> bytes:
 
 
 def test_a_line_tells_time_peer_case_and_fields(wire: Wire) -> None:
-    told = tapped_datagram(0, "board", datagram(wire, "i32=5", "mode=MODE_ON"), wire)
+    (told,) = tapped_datagram(0, "board", datagram(wire, "i32=5", "mode=MODE_ON"), wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == "board every_kind i32=5 mode=MODE_ON"
     assert told.line(with_hex=True).endswith("[0a0410056001]")
 
 
 def test_repairs_are_told(wire: Wire) -> None:
-    assert tapped_datagram(0, "board", b"\x12", wire).line(with_hex=False).endswith("(trimmed: 1 zeros restored)")
-    assert tapped_datagram(0, "board", b"\x12\0\0\0", wire).line(with_hex=False).endswith("(padded: 2 zeros removed)")
+    (trimmed,), (padded,) = (tapped_datagram(0, "board", data, wire) for data in (b"\x12", b"\x12\0\0\0"))
+    assert trimmed.line(with_hex=False).endswith("(trimmed: 1 zeros restored)")
+    assert padded.line(with_hex=False).endswith("(padded: 2 zeros removed)")
+
+
+def test_each_message_of_a_datagram_has_a_line() -> None:
+    program = check_table(TABLES / "vision.yaml", {}).program
+    assert program is not None
+    told = tapped_datagram(0, "camera", b"\x3a\x02\x08\x09\x12\x02\x08\x05", Wire(program.envelope))
+    assert [each.line(with_hex=False).split(" ", 1)[1] for each in told] == [
+        "camera detection frame=5",
+        "camera geometry length=9",
+    ]
 
 
 def test_payloads_that_the_last_one_replaces_are_told(wire: Wire) -> None:
     other = wire.encode(wire.case("plain"), payload(wire.case("plain"), []))
-    told = tapped_datagram(0, "board", other + datagram(wire, "i32=5"), wire)
+    (told,) = tapped_datagram(0, "board", other + datagram(wire, "i32=5"), wire)
     assert told.line(with_hex=False).endswith("every_kind i32=5 (superseded: plain)")
     assert json.loads(told.json(with_hex=False))["superseded"] == ["plain"]
 
 
 def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> None:
-    told = tapped_datagram(0, "127.0.0.1:5", b"\xff\xff", wire)
+    (told,) = tapped_datagram(0, "127.0.0.1:5", b"\xff\xff", wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == (
         "127.0.0.1:5 undecodable (malformed: does not parse as PBEnvelope): ffff"
     )
@@ -50,13 +65,14 @@ def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> N
 
 
 def test_a_rejected_datagram_is_marked_with_the_reason(wire: Wire) -> None:
-    told = tapped_datagram(0, "127.0.0.9:5", datagram(wire, "i32=5"), wire, "source_mismatch")
+    (told,) = tapped_datagram(0, "127.0.0.9:5", datagram(wire, "i32=5"), wire, "source_mismatch")
     assert " 127.0.0.9:5 rejected (source_mismatch) every_kind i32=5" in told.line(with_hex=False)
     assert json.loads(told.json(with_hex=False))["rejected"] == "source_mismatch"
 
 
 def test_json_has_the_fields_by_their_proto_names(wire: Wire) -> None:
-    said = json.loads(tapped_datagram(0, "board", datagram(wire, "point.x=3", "single=nan"), wire).json(with_hex=False))
+    (told,) = tapped_datagram(0, "board", datagram(wire, "point.x=3", "single=nan"), wire)
+    said = json.loads(told.json(with_hex=False))
     assert said["fields"] == {"single": "NaN", "point": {"x": 3}}
     assert (said["case"], said["peer"], said["bytes"], "hex" in said) == ("every_kind", "board", 11, False)
 

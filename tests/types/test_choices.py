@@ -111,3 +111,17 @@ def test_what_is_wrong_is_said(folder: Path, data: bytes, why: str) -> None:
     assert envelope is not None
     said, _, _ = why_rejected(envelope, data, len(data), repairs=True).partition("; ")  # guesses follow
     assert said == why
+
+
+def test_fields_beside_each_other_are_locked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "protos" / "b.proto").write_text(
+        'syntax = "proto3"; import "a.proto"; message Packet { Referee referee = 2; Referee judge = 1; uint32 at = 3; }'
+    )
+    write_table(folder, "message: Packet, cases: [referee]")
+    assert main(["schema", "lock", "--table", "table.yaml"]) == OK
+    assert main(["validate", "--strict", "table.yaml"]) == OK
+    lock = json.loads((folder / "protos" / "envelope.lock.json").read_text())
+    assert lock["envelope"] == {"message": "Packet", "by": "cases", "max_size": 22}
+    write_table(folder, "message: Packet, cases: [referee, judge]")
+    assert main(["validate", "--strict", "table.yaml"]) == BAD_TABLE
+    assert "no route for the payload case judge" in capsys.readouterr().out

@@ -168,6 +168,7 @@ size_t envelope_restored_size(const uint8_t *data, size_t size) {
 
 static int (*const FIND_CASE[])(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope) = {
     [BY_ONEOF] = find_by_oneof,
+    [BY_CASES] = find_by_oneof,
     [BY_FRAME] = find_by_frame,
     [BY_NAME] = find_by_name,
 };
@@ -183,4 +184,40 @@ int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, 
     envelope->size = (uint32_t)whole;
     envelope->is_repaired = whole != size;
     return FIND_CASE[schema->case_by](schema, data, envelope);
+}
+
+/* The number of the payload case that a field is, or 0. */
+static uint32_t case_of(const struct wire_schema *schema, uint32_t tag) {
+    const struct wire_field *field = find_wire_field(&schema->types[0], tag >> 3);
+    return field != NULL && (field->flags & WIRE_CASE) && is_declared(field, tag & 7) ? tag >> 3 : 0;
+}
+
+static bool read_field_of(struct bytes *rest, uint32_t *tag) {
+    struct bytes value;
+    return read_tag(rest, tag) && read_value(rest, *tag & 7, &value);
+}
+
+static uint32_t next_case(const struct wire_schema *schema, struct bytes frame, uint32_t after) {
+    uint32_t next = 0, tag;
+    while (frame.at < frame.end && read_field_of(&frame, &tag)) {
+        uint32_t number = case_of(schema, tag);
+        if (number > after && (next == 0 || number < next)) next = number;
+    }
+    return next;
+}
+
+bool envelope_part(const struct wire_schema *schema, struct bytes frame, uint32_t after, uint8_t *part,
+                   struct envelope *envelope) {
+    uint32_t next = next_case(schema, frame, after), tag;
+    if (next == 0) return false;
+    *envelope = (struct envelope){0};
+    while (frame.at < frame.end) {
+        const uint8_t *begin = frame.at;
+        if (!read_field_of(&frame, &tag)) return false;
+        uint32_t number = case_of(schema, tag), size = (uint32_t)(frame.at - begin);
+        if (number != 0 && number != next) continue;
+        memcpy(part + envelope->size, begin, size);
+        envelope->size += size;
+    }
+    return find_by_oneof(schema, part, envelope) < 0;
 }

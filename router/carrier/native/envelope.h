@@ -7,6 +7,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "wire.h"
 #include "wire_schema.h"
 
 enum { MAX_DATAGRAM = 16 * 1024 }; /* bytes; a longer datagram is rejected as TRUNCATED */
@@ -19,7 +20,7 @@ struct envelope {
     uint32_t case_number;
     uint32_t size;          /* with restored trailing zeros, without padding */
     uint32_t start, length; /* of the payload, or from the tag of its first piece to the end of its last one */
-    uint32_t superseded;    /* payloads before it, of other cases: protobuf keeps only the last member of a oneof */
+    uint32_t others;        /* payloads of other cases before it, which it supersedes except BY_CASES */
     bool is_single;         /* the payload is in one piece */
     bool is_repaired;       /* `size` differs from that of the datagram; counted as padded, even without a payload */
 };
@@ -38,5 +39,10 @@ size_t envelope_restored_size(const uint8_t *data, size_t size);
  * Return -1, or one of TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD and UNKNOWN_CASE. `case_number` is then the number of the
  * unknown field; if MALFORMED, that of a payload case that is not encoded as a message, or 0. */
 int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, bool repairs, struct envelope *envelope);
+
+/* Of a frame that holds several messages (BY_CASES), write to `part` the first one whose case has a number above `after`: all
+ * its pieces, and the fields beside the messages. Return false if there is none. */
+bool envelope_part(const struct wire_schema *schema, struct bytes frame, uint32_t after, uint8_t *part,
+                   struct envelope *envelope);
 
 #endif

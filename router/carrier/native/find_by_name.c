@@ -67,7 +67,7 @@ int find_by_name(const struct wire_schema *schema, const uint8_t *frame, struct 
     envelope->case_number = number;
     envelope->start = (uint32_t)(payload.value.at - frame);
     envelope->length = (uint32_t)left(&payload.value);
-    envelope->superseded = (name.count > payload.count ? name.count : payload.count) - 1;
+    envelope->others = (name.count > payload.count ? name.count : payload.count) - 1;
     envelope->is_single = true;
     return -1;
 }

@@ -1,4 +1,6 @@
-/* The payload is the last member of the envelope's oneof. Consecutive pieces of one member are merged, as protobuf does. */
+/* The payload is the last member of the envelope's oneof. Consecutive pieces of one member are merged, as protobuf does.
+ *
+ * BY_CASES, if there are `others`, envelope_part has to tell the messages apart. */
 #include "find_case.h"
 
 int find_by_oneof(const struct wire_schema *schema, const uint8_t *frame, struct envelope *envelope) {
@@ -16,7 +18,7 @@ int find_by_oneof(const struct wire_schema *schema, const uint8_t *frame, struct
         if (is_case && is_declared(field, wire_type)) {
             pieces = number == envelope->case_number ? pieces + 1 : 1;
             if (pieces == 1) first = begin;
-            if (pieces == 1 && envelope->case_number != 0) envelope->superseded++;
+            if (pieces == 1 && envelope->case_number != 0) envelope->others++;
             envelope->case_number = number;
             envelope->start = pieces == 1 ? (uint32_t)(value.at - frame) : first;
             envelope->length = (uint32_t)(value.end - frame) - envelope->start;

@@ -32,7 +32,7 @@ static void reject(struct routing *routing, const struct received *received, enu
 
 static void report_superseded(struct routing *routing, const struct received *received) {
     struct datagram_event event = {.kind = EVENT_SUPERSEDED, .counter = received->listener->superseded};
-    env_count(&routing->env, event.counter, received->envelope.superseded);
+    env_count(&routing->env, event.counter, received->envelope.others);
     report(routing, received, event);
 }
 
@@ -261,6 +261,28 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     return ROUTED;
 }
 
+/* Route each message of a datagram that holds several, as a datagram of its own. Return ROUTED if one of them has a route, or the
+ * reason for rejecting the last one. */
+static __attribute__((noinline)) int route_each(struct routing *routing, struct received *received) {
+    const struct protocol *protocol = received->listener->protocol;
+    const struct envelope whole = received->envelope;
+    size_t length = received->length;
+    int outcome = UNHANDLED;
+    memcpy(routing->frame, routing->datagram, whole.size);
+    struct bytes frame = {routing->frame, routing->frame + whole.size};
+    for (uint32_t number = 0; envelope_part(&protocol->schema, frame, number, routing->datagram, &received->envelope);) {
+        number = received->envelope.case_number;
+        received->length = received->envelope.size;
+        int reason = route(routing, find_case(protocol, number), received);
+        if (reason != ROUTED) reject(routing, received, (enum reason)reason);
+        if (outcome != ROUTED) outcome = reason;
+    }
+    memcpy(routing->datagram, routing->frame, whole.size);
+    received->envelope = whole;
+    received->length = length;
+    return outcome;
+}
+
 /* ---- silences ---- */
 
 /* An endpoint is heard again, last time at `before` (0: never). If it had been heard for less time than it was silent, that
@@ -306,7 +328,10 @@ int route_datagram(struct routing *routing, struct received *received) {
     int reason = envelope_read(&protocol->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
     if (received->envelope.is_repaired) env_count(&routing->env, listener->padded, 1);
-    if (received->envelope.superseded) report_superseded(routing, received);
+    if (received->envelope.others) {
+        if (protocol->schema.case_by == BY_CASES) return route_each(routing, received);
+        report_superseded(routing, received);
+    }
     if (reason == UNKNOWN_CASE) env_count(&routing->env, protocol->unknown_case, 1);
     if (reason == ROUTED) reason = route(routing, find_case(protocol, received->envelope.case_number), received);
     if (reason != ROUTED) reject(routing, received, (enum reason)reason);

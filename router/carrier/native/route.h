@@ -23,6 +23,7 @@ struct routing {
     /* A datagram, and its record for the ring. Last, as they are large. */
     _Alignas(8) uint8_t datagram[MAX_DATAGRAM + 8];
     _Alignas(8) uint8_t record[MAX_DATAGRAM + 256];
+    uint8_t frame[MAX_DATAGRAM]; /* the datagram, while its messages are routed one by one */
 };
 
 /* A received datagram. */

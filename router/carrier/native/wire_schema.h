@@ -26,6 +26,7 @@ struct wire_type {
 /* How an envelope says which message it holds. */
 enum case_by {
     BY_ONEOF, /* the member of a oneof */
+    BY_CASES, /* each of some fields of the envelope that is present: a frame may hold several messages */
     BY_FRAME, /* the frame is the message of the only case, ONLY_CASE */
     BY_NAME   /* a field with the name of the message, and one with its bytes */
 };

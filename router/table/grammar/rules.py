@@ -58,10 +58,14 @@ COMPLETE: Schema = {
             "envelope": {
                 "required": ["message"],
                 "if": {"required": ["case"]},
-                "then": without("oneof", "is not allowed with 'case': with it, the datagram itself is the message"),
+                "then": without(
+                    "oneof|cases", "is not allowed with 'case': with it, the datagram itself is the message"
+                ),
                 "else": {
-                    "required": ["oneof"],
                     **without("payload", "needs 'case', the field that names the message"),
+                    "if": {"required": ["cases"]},
+                    "then": without("oneof", "is not allowed with 'cases': either says which fields are payload cases"),
+                    "else": {"required": ["oneof"]},
                 },
             },
             "http": {"required": ["address"]},

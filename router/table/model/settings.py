@@ -1,6 +1,6 @@
 """Settings of the table as a whole: envelope, node, servers, recording."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -32,10 +32,17 @@ class EnvelopeSettings:
     Example: PBEnvelope
     """
     oneof: Located[str] | None = None
-    """The name of the envelope's oneof whose members are the payload cases. Instead of it: `case`.
+    """The name of the envelope's oneof whose members are the payload cases. Instead of it: `cases` or `case`.
 
     Title: Payload oneof
     Example: payload
+    """
+    cases: Annotated[tuple[Located[str], ...], SOME] = ()
+    """Instead of `oneof`: fields of the envelope whose type is a message. Each one that is present in a datagram is a
+    message of its own.
+
+    Title: Fields that are cases
+    Example: [detection, geometry]
     """
     case: Annotated[Located[str] | None, Shape("node_name")] = None
     """Instead of `oneof`. Alone: the datagram is itself the message of a single payload case, which gets this name.
@@ -75,10 +82,11 @@ class EnvelopeSettings:
     """
 
     @property
-    def choice(self) -> Mapping[str, Located[str]]:
-        """The keys that say how the envelope holds payloads: `oneof`, `case`, or `case` and `payload`."""
+    def choice(self) -> Mapping[str, Sequence[Located[str]]]:
+        """The keys that say how the envelope holds payloads: `oneof`, `cases`, `case`, or `case` and `payload`."""
         keys = {"oneof": self.oneof, "case": self.case, "payload": self.payload}
-        return {name: value for name, value in keys.items() if value is not None}
+        chosen = {name: (value,) for name, value in keys.items() if value is not None}
+        return {**chosen, "cases": self.cases} if self.cases else chosen
 
     @property
     def has_many(self) -> bool:
