@@ -37,8 +37,9 @@ class Choice(IntEnum):
     """How a frame says which message it is; the surest sign comes last."""
 
     WHOLE = 0
-    NAMED = 1
-    ONEOF = 2
+    CASES = 1
+    NAMED = 2
+    ONEOF = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,8 +178,17 @@ def _candidate(message: MessageType, roots: Sequence[MessageType]) -> Candidate:
         return Candidate(message, Choice.ONEOF, {"oneof": oneof}, _payloads(groups[oneof]))
     if named := _name_and_bytes(message):
         return Candidate(message, Choice.NAMED, named, {root.name: root for root in roots if root is not message})
+    optional = [member for member in message.fields if _is_optional_message(member)]
+    if len(optional) > 1 and 2 * len(optional) > len(message.fields):
+        cases = ", ".join(member.name for member in optional)
+        return Candidate(message, Choice.CASES, {"cases": f"[{cases}]"}, _payloads(optional))
     case = _WORD_BORDER.sub("_", message.short_name).lower()
     return Candidate(message, Choice.WHOLE, {"case": case}, {case: message})
+
+
+def _is_optional_message(member: Field) -> bool:
+    is_single = isinstance(member.type, MessageType) and not member.is_group
+    return is_single and not member.is_required and member.oneof in (None, f"_{member.name}")
 
 
 def _name_and_bytes(message: MessageType) -> dict[str, str]:

@@ -40,8 +40,11 @@ foxglove: {{address: 127.0.0.1:@foxglove}}
 """The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
 
 MADE_BY_PROMETHEUS = {"up"}
-OF_OTHER_TABLES = {"router_messages_collected_total", "router_gateway_connections", "router_deadman_disobeyed"}
-"""No route of the rover collects, no gateway of it is in a Zenoh network, and no deadman has `obeyed`."""
+OF_OTHER_TABLES = {
+    "router_messages_collected_total", "router_gateway_connections", "router_deadman_disobeyed",
+    "router_groups_not_joined", "router_endpoint_unresolved",
+}  # fmt: skip
+"""The rover has no route that collects, Zenoh gateway, deadman with `obeyed`, multicast group or host name."""
 OF_OTHERS = {"router_type_incompatible", "router_other_routers"}
 """Nobody else is in the ROS domain."""
 OF_SILENT_ENDPOINTS = {"instance_endpoint_target_reason:router_messages_dropped:rate1m"}

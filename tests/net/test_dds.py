@@ -19,7 +19,6 @@ from router.compiler.compiled_table import CompiledTable
 from router.errors import ConfigurationError
 from router.net.dds import clashes
 from router.net.kernel import BELOW_ROS, why_not_bound
-from tests.ports import free_port
 from tests.small_tables import HEAD
 from tests.tables import PROTOS
 
@@ -38,7 +37,7 @@ os._exit(0)
 def table(folder: Path, port: int, route: str = TO_ROS) -> Path:
     text = HEAD.replace("PROTOS", str(PROTOS)) + route
     path = folder / "table.yaml"
-    path.write_text(text.replace("127.0.0.1:5000", f"127.0.0.1:{port}").replace(":5001", f":{free_port()}"))
+    path.write_text(text.replace("127.0.0.1:5000", f"127.0.0.1:{port}"))
     return path
 
 

@@ -21,6 +21,7 @@ ONEOF = """
     message FromRobot { uint32 reqId = 1; oneof payload { Pose pose = 2; Nothing nothing = 3; Name yes = 4; } }
     message ToRobot { optional uint32 reqId = 1; oneof payload { Pose pose = 2; } }
 """
+CASES = "message Packet { Ball ball = 1; Ball robot = 2; uint32 number = 3; } message Ball { float x = 1; }"
 NAMED = "message Wrapped { string name = 1; bytes data = 2; } message Drive { float speed = 1; } message Arm {}"
 WHOLE = "message RefereeState { uint32 stage = 1; Team blue = 2; } message Team { string name = 1; }"
 
@@ -36,6 +37,7 @@ def protos(folder: Path, text: str) -> Path:
     ("text", "envelope", "choice", "settings", "cases"),
     [
         (ONEOF, "FromRobot", Choice.ONEOF, {"oneof": "payload"}, ["pose", "nothing", "yes"]),
+        (CASES, "Packet", Choice.CASES, {"cases": "[ball, robot]"}, ["ball", "robot"]),
         (NAMED, "Wrapped", Choice.NAMED, {"case": "name", "payload": "data"}, ["robo.Drive", "robo.Arm"]),
         (WHOLE, "RefereeState", Choice.WHOLE, {"case": "referee_state"}, ["referee_state"]),
     ],
@@ -48,7 +50,7 @@ def test_the_likeliest_envelope(
     assert (first.settings, [*first.cases]) == (settings, cases)
 
 
-@pytest.mark.parametrize("text", [ONEOF, NAMED, WHOLE])
+@pytest.mark.parametrize("text", [ONEOF, CASES, NAMED, WHOLE])
 def test_a_proposed_table_is_right(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "robot"
     assert main(["init", str(folder), "--protos", str(protos(tmp_path, text))]) == OK
