@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
@@ -39,7 +39,7 @@ def chosen_envelope(schema: ProtoSchema, choice: Mapping[str, Sequence[Located[s
 def shared_envelope(schema: ProtoSchema, names: Sequence[Located[str]]) -> Envelope:
     """Return an envelope of which each of these fields that is present is a message. Raises TableError."""
     envelope = schema.descriptor(schema.envelope)
-    fields = sorted({_field(schema, envelope, name, _is_message, "a message type") for name in names}, key=_number)
+    fields = sorted({_case_field(schema, envelope, name) for name in names}, key=_number)
     if refused := list(undecidable([envelope], (), schema.place)):
         raise TableError(refused)
     cases = {field.name: replace(payload_case(schema, field), wrapped=_shared(field)) for field in fields}
@@ -54,8 +54,12 @@ def shared_envelope(schema: ProtoSchema, names: Sequence[Located[str]]) -> Envel
     )
 
 
-def _is_message(field: FieldDescriptor) -> bool:
-    return field.type == FieldDescriptor.TYPE_MESSAGE and not field.is_required
+def _case_field(schema: ProtoSchema, envelope: Descriptor, name: Located[str]) -> FieldDescriptor:
+    field = _field(schema, envelope, name, FieldDescriptor.TYPE_MESSAGE, "message")
+    if field.is_required:
+        what = f"'{name.value}' of {envelope.full_name} is required, but each message goes on without the others"
+        raise TableError.of(name.span, Code.BAD_VALUE, what, f"make it optional: {schema.place(field.full_name)}")
+    return field
 
 
 def _number(field: FieldDescriptor) -> int:
@@ -83,8 +87,8 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
     Each message of the compiled files is a case. Raises TableError.
     """
     envelope = schema.descriptor(schema.envelope)
-    of_name = _field(schema, envelope, name, _is_text, "type string")
-    of_payload = _field(schema, envelope, payload, _is_bytes, "type bytes")
+    of_name = _field(schema, envelope, name, FieldDescriptor.TYPE_STRING, "string")
+    of_payload = _field(schema, envelope, payload, FieldDescriptor.TYPE_BYTES, "bytes")
     messages = sorted(_messages(schema), key=lambda message: message.full_name.encode())
     if refused := list(undecidable([envelope, *messages], (), schema.place)):
         raise TableError(refused)
@@ -120,29 +124,15 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
     )
 
 
-def _is_text(field: FieldDescriptor) -> bool:
-    return field.type == FieldDescriptor.TYPE_STRING
-
-
-def _is_bytes(field: FieldDescriptor) -> bool:
-    return field.type == FieldDescriptor.TYPE_BYTES
-
-
-def _field(
-    schema: ProtoSchema,
-    envelope: Descriptor,
-    name: Located[str],
-    has_kind: Callable[[FieldDescriptor], bool],
-    kind: str,
-) -> FieldDescriptor:
+def _field(schema: ProtoSchema, envelope: Descriptor, name: Located[str], kind: int, text: str) -> FieldDescriptor:
     """Return a field of the envelope. Raises TableError if it does not exist, or has another type."""
     field = envelope.fields_by_name.get(name.value)
-    fits = [each.name for each in envelope.fields if has_kind(each) and not each.is_repeated and not _excludes(each)]
+    fits = [each.name for each in envelope.fields if each.type == kind and not each.is_repeated and not _excludes(each)]
     if field is None:
         what = f"{envelope.full_name} has no field '{name.value}'"
         raise TableError.of(name.span, Code.BAD_VALUE, what, did_you_mean(name.value, fits))
     if field.name not in fits:
-        what = f"'{name.value}' of {envelope.full_name} must be a single field of {kind}, not in a oneof"
+        what = f"'{name.value}' of {envelope.full_name} must be a single field of type {text}, not in a oneof"
         raise TableError.of(name.span, Code.BAD_VALUE, what, f"see {schema.place(field.full_name)}")
     return field
 

@@ -30,8 +30,12 @@ NAMED = [
 
 
 SHARED = [
-    b"\x12\x02\x08\x05", b"\x3a\x02\x08\x09\x18\x03\x12\x04\x08\x05\x12\x00", b"\x3a\x00\x12", b"\x3a\x00\x12\x00\0\0",
-]  # fmt: skip
+    b"\x12\x02\x08\x05",
+    b"\x3a\x02\x08\x09\x18\x03\x12\x04\x08\x05\x12\x00",
+    b"\x3a\x00\x12",
+    b"\x3a\x00\x12\x00\0\0",
+]
+DATAGRAMS = [("framed.yaml", FRAMED), ("named.yaml", NAMED), ("vision.yaml", SHARED)]
 
 
 def program(table: str) -> CompiledTable:
@@ -40,9 +44,7 @@ def program(table: str) -> CompiledTable:
     return made
 
 
-@pytest.mark.parametrize(
-    ("table", "datagrams"), [("framed.yaml", FRAMED), ("named.yaml", NAMED), ("vision.yaml", SHARED)]
-)
+@pytest.mark.parametrize(("table", "datagrams"), DATAGRAMS)
 def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tmp_path: Path) -> None:
     made = program(table)
     batch = [shown(data, START + number) for number, data in enumerate(datagrams)]

@@ -125,3 +125,12 @@ def test_fields_beside_each_other_are_locked(folder: Path, capsys: pytest.Captur
     write_table(folder, "message: Packet, cases: [referee, judge]")
     assert main(["validate", "--strict", "table.yaml"]) == BAD_TABLE
     assert "no route for the payload case judge" in capsys.readouterr().out
+
+
+def test_a_required_message_is_not_one_of_several(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "protos" / "b.proto").write_text(
+        'syntax = "proto2"; import "a.proto"; message Packet { required Referee referee = 2; }'
+    )
+    write_table(folder, "message: Packet, cases: [referee]")
+    assert main(["validate", "table.yaml"]) == BAD_TABLE
+    assert "'referee' of Packet is required, but each message goes on without the others" in capsys.readouterr().out
