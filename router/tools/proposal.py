@@ -103,7 +103,7 @@ _ENDPOINTS = """\
 http: {address: 127.0.0.1:9108}   # the status page
 
 listen:
-  robot: {address: 127.0.0.1:5000}
+  robot: {address: 127.0.0.1:5000, framing: exact}   # a datagram that was cut short is malformed
 
 endpoints:
   robot: {address: 127.0.0.2:8008, kind: board}   # known by its IP address
