@@ -126,8 +126,8 @@ static bool takes_packed_varints(struct check *check, const struct board_field *
 static bool takes_packed(struct check *check, const struct board_field *field, struct bytes values) {
     if (field->kind == WIRE_VARINT) return takes_packed_varints(check, field, values);
     size_t size = field->kind == WIRE_I64 ? 8 : 4;
-    if (!takes_more(check, field, left(&values) / size)) return false;
-    for (; left(&values) >= size; values.at += size)
+    if (!takes_more(check, field, bytes_left(&values) / size)) return false;
+    for (; bytes_left(&values) >= size; values.at += size)
         if (!takes_number(check, field, values.at)) return false;
     return true;
 }
@@ -148,7 +148,7 @@ static bool takes_len(struct check *check, const struct board_field *field, stru
     case WIRE_MESSAGE:
         check->rest.at = value.at;
         return takes_more(check, field, 1) && enter(check, field, value.end);
-    case WIRE_BYTES: return takes_more(check, field, 1) && takes_length(check, field, left(&value));
+    case WIRE_BYTES: return takes_more(check, field, 1) && takes_length(check, field, bytes_left(&value));
     default: return takes_packed(check, field, value);
     }
 }

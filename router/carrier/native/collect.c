@@ -182,8 +182,8 @@ static uint32_t write_payload(const struct datagram *from, uint8_t *to) {
         return from->length;
     }
     while (rest.at < rest.end && read_piece(&rest, &tag, &piece)) {
-        memcpy(to + size, piece.at, left(&piece));
-        size += (uint32_t)left(&piece);
+        memcpy(to + size, piece.at, bytes_left(&piece));
+        size += (uint32_t)bytes_left(&piece);
     }
     return size;
 }

@@ -13,8 +13,8 @@ enum { MOST_LEVELS = 100 /* of nested messages and groups, known or unknown */ }
 
 /* Whether packed scalars are whole. */
 static bool is_packed(uint8_t kind, struct bytes values) {
-    if (kind == WIRE_I64) return left(&values) % 8 == 0;
-    if (kind == WIRE_I32) return left(&values) % 4 == 0;
+    if (kind == WIRE_I64) return bytes_left(&values) % 8 == 0;
+    if (kind == WIRE_I32) return bytes_left(&values) % 4 == 0;
     uint64_t value;
     while (values.at < values.end) {
         if (!read_varint(&values, LONGEST_VARINT, &value)) return false;
@@ -56,7 +56,7 @@ static bool read_known_len(struct walk *walk, const struct wire_type *type, uint
         walk->rest.at = value.at;
         return enter(walk, value.end, &walk->schema->types[field->type], NO_GROUP);
     }
-    if (field->kind == WIRE_STRING) return is_utf8(value.at, left(&value));
+    if (field->kind == WIRE_STRING) return is_utf8(value.at, bytes_left(&value));
     if (field->flags & WIRE_PACKABLE) return is_packed(field->kind, value);
     return true;
 }
@@ -121,7 +121,7 @@ static bool is_usual(const struct wire_schema *schema, const uint8_t *data, stru
     if (!read_varint(&rest, 2, &tag) || (tag & 7) != LEN) return false;
     const struct wire_field *field = find_wire_field(&schema->types[0], (uint32_t)tag >> 3);
     if (field == NULL || !(field->flags & WIRE_ROUTED)) return false;
-    if (!read_varint(&rest, 2, &size) || size != left(&rest)) return false;
+    if (!read_varint(&rest, 2, &size) || size != bytes_left(&rest)) return false;
     if (!is_well_formed(schema, &schema->types[field->type], rest)) return false;
     envelope->case_number = field->number;
     envelope->start = (uint32_t)(rest.at - data);

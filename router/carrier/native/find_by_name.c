@@ -5,7 +5,7 @@
 #include <string.h>
 
 static int compare(struct bytes text, const struct wire_name *name) {
-    size_t size = left(&text), shorter = size < name->size ? size : name->size;
+    size_t size = bytes_left(&text), shorter = size < name->size ? size : name->size;
     int order = shorter ? memcmp(text.at, name->text, shorter) : 0;
     return order ? order : (size > name->size) - (size < name->size);
 }
@@ -58,15 +58,15 @@ int find_by_name(const struct wire_schema *schema, const uint8_t *frame, struct 
         take(&name, tag, value);
         take(&payload, tag, value);
     }
-    if (left(&name.value) == 0) return name.is_mistyped ? mistyped(envelope, &name) : NO_PAYLOAD;
+    if (bytes_left(&name.value) == 0) return name.is_mistyped ? mistyped(envelope, &name) : NO_PAYLOAD;
     uint32_t number = number_of(schema, name.value);
     if (number == 0) return UNKNOWN_CASE;
-    if (left(&payload.value) == 0 && payload.is_mistyped) return mistyped(envelope, &payload);
+    if (bytes_left(&payload.value) == 0 && payload.is_mistyped) return mistyped(envelope, &payload);
     uint16_t type = schema->names[number - 1].type;
     if (type != 0 && !is_well_formed(schema, &schema->types[type], payload.value)) return MALFORMED;
     envelope->case_number = number;
     envelope->start = (uint32_t)(payload.value.at - frame);
-    envelope->length = (uint32_t)left(&payload.value);
+    envelope->length = (uint32_t)bytes_left(&payload.value);
     envelope->others = (name.count > payload.count ? name.count : payload.count) - 1;
     envelope->is_single = true;
     return -1;

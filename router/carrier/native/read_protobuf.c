@@ -74,7 +74,7 @@ static bool is_known(const struct machine *machine, const struct wanted_field *f
 }
 
 static struct value range(const struct bytes *bytes) {
-    return (struct value){.bytes = bytes->at, .size = (uint32_t)left(bytes)};
+    return (struct value){.bytes = bytes->at, .size = (uint32_t)bytes_left(bytes)};
 }
 
 static bool read_element(struct machine *machine, const struct wanted_field *field, struct bytes *from) {

@@ -26,7 +26,7 @@ struct bytes {
     const uint8_t *at, *end;
 };
 
-static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
+static inline size_t bytes_left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
 
 /* Read a varint of at most `longest` bytes. It may be longer than necessary; bits beyond 64 are dropped. If it is cut or too
  * long, `value` is the part that was read. */
@@ -56,7 +56,7 @@ static inline bool read_tag(struct bytes *bytes, uint32_t *tag) {
 }
 
 static inline bool skip(struct bytes *bytes, uint64_t size) {
-    if (size > left(bytes)) return false;
+    if (size > bytes_left(bytes)) return false;
     bytes->at += size;
     return true;
 }
