@@ -6,7 +6,7 @@ fixed place, which the carrier fills when it sends the message (`native/beside.h
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from router.compiler.constants import fields_of
 from router.compiler.expressions import ExpressionError, check
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import UINT64, FloatKind
-from router.compiler.expressions.tree import ENVELOPE, Binary, Constant, Node, Operator, Variable, parts_of
+from router.compiler.expressions.tree import ENVELOPE, Binary, Constant, Node, Operator, Variable, walk
 from router.compiler.mapping import Row, build
 from router.compiler.plan import Plan, Record, Unset
 from router.declared import BesideEncoding, BesideValue, Op
@@ -125,7 +125,7 @@ class _Set:
             node = check(expression, replace(self.lookup.scope(_NOTHING, names=names), given=()))
         except ExpressionError:
             return None
-        if not any(isinstance(each, Variable) for each in _all_of(node)):
+        if not any(isinstance(each, Variable) for each in walk(node)):
             return None
         value = _simple(node)
         if value is None:
@@ -214,12 +214,6 @@ def _times(factor: Constant) -> _Value | None:
     if not isinstance(number, (int, float)) or not 0 < number < 1e18:
         return None
     return _Value(is_time=True, factor=Fraction(repr(number)))
-
-
-def _all_of(node: Node) -> Iterator[Node]:
-    yield node
-    for part in parts_of(node):
-        yield from _all_of(part)
 
 
 def _field_at(message: Descriptor, path: Path) -> FieldDescriptor:

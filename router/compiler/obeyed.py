@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from router.compiler.compiled_table import ObeyedPlan
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import BoolKind
-from router.compiler.expressions.tree import Node, Present, Read, parts_of
+from router.compiler.expressions.tree import Present, Read, walk
 from router.compiler.lookup import Lookup
 from router.errors import Code, Located
 from router.table.model.routes import ANY, Deadman, Obeyed, Route
@@ -31,7 +29,7 @@ def check_obeyed(lookup: Lookup, route: Route) -> ObeyedPlan | None:
     when = lookup.value(obeyed.when, lookup.received(case), (BoolKind,), "'obeyed' takes a bool", hint)
     if when is None:
         return None
-    if not any(isinstance(node, (Read, Present)) for node in _nodes(when)):
+    if not any(isinstance(node, (Read, Present)) for node in walk(when)):
         message = f"this reads no field of '{case.name}', so it shows nothing about the board"
         lookup.report(when.span, Code.BAD_VALUE, message, "compare a field that says how fast the motors turn")
         return None
@@ -65,9 +63,3 @@ def _watched(lookup: Lookup, deadman: Deadman, case: Located[str]) -> tuple[str,
         hint = f"write a case that '{missing}' sends, or add it to the sources of a route of '{case.value}'"
         lookup.report(case.span, Code.BAD_VALUE, message, hint)
     return endpoints
-
-
-def _nodes(node: Node) -> Iterator[Node]:
-    yield node
-    for part in parts_of(node):
-        yield from _nodes(part)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, Variable, parts_of
+from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, Variable, walk
 
 
 def states_in(conditions: Iterable[Node | None]) -> list[str]:
     """Return the names of the states that conditions read, each once."""
-    nodes = (node for condition in conditions if condition is not None for node in _nodes(condition))
+    nodes = (node for condition in conditions if condition is not None for node in walk(condition))
     return list(dict.fromkeys(name for node in nodes if (name := _state(node)) is not None))
 
 
@@ -27,12 +27,6 @@ def operands_of(conditions: Iterable[Node | None]) -> Iterator[Node]:
             yield condition
 
 
-def _nodes(node: Node) -> Iterator[Node]:
-    yield node
-    for part in parts_of(node):
-        yield from _nodes(part)
-
-
 def _state(node: Node) -> str | None:
     """Return the name of the state that a node reads, None for other nodes."""
     if not isinstance(node, Variable) or not node.name.startswith(f"{STATE}."):
@@ -44,5 +38,5 @@ def reads_message(node: Node) -> bool:
     """Return whether a condition depends on the message."""
     return any(
         isinstance(each, (Read, Present)) or (isinstance(each, Variable) and _state(each) is None)
-        for each in _nodes(node)
+        for each in walk(node)
     )

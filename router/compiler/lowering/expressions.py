@@ -245,11 +245,8 @@ def _can_be_kept(node: tree.Node) -> bool:
 
 
 def _variables(node: tree.Node) -> Iterator[str]:
-    """Yield the names of all variables that a node reads."""
-    if isinstance(node, tree.Variable):
-        yield node.name
-    for part in tree.parts_of(node):
-        yield from _variables(part)
+    """Return the names of all variables that a node reads."""
+    return (each.name for each in tree.walk(node) if isinstance(each, tree.Variable))
 
 
 def _is_unchecked(holder: Section, member: Field, kind: Kind) -> bool:
