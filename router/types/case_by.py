@@ -6,6 +6,7 @@ A frame is a datagram with its trailing zeros restored. The fields of the classe
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby, islice
 from typing import TYPE_CHECKING, ClassVar, Union
@@ -93,15 +94,10 @@ class _ByField:
 
     def _numbers(self, datagram: bytes, numbers: Container[int]) -> Iterator[int]:
         """Yield the number of each field that is one of the cases with these `numbers`."""
-        position = 0
-        try:
-            while position < len(datagram):
-                tag, position = read_varint(datagram, position)
+        with suppress(IndexError):
+            for tag, _ in _fields(datagram):
                 if tag >> 3 in numbers:
                     yield tag >> 3
-                position = _after(datagram, position, tag & 7)
-        except IndexError:
-            pass  # it ends early: zeros were trimmed, or it is malformed
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +145,18 @@ class ByCases(_ByField):
 def _unknown_fields(frame: Message) -> list[int]:
     fields = UnknownFieldSet(frame)
     return [fields[index].field_number for index in range(len(fields))]
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield the tag of each field, and where its value begins.
+
+    Raises IndexError at the end of data that end early: zeros were trimmed, or they are malformed.
+    """
+    position = 0
+    while position < len(data):
+        tag, start = read_varint(data, position)
+        yield tag, start
+        position = _after(data, start, tag & 7)
 
 
 def _after(data: bytes, position: int, wire_type: int) -> int:
@@ -254,15 +262,12 @@ class ByName:
         return [self.cases[text][0] if text in self.cases else text for text in texts]
 
     def numbers_in(self, datagram: bytes, numbers: Container[int]) -> Sequence[int]:
-        text, position = b"", 0
-        try:
-            while position < len(datagram):
-                tag, start = read_varint(datagram, position)
-                position = _after(datagram, start, tag & 7)
+        text = b""
+        with suppress(IndexError):
+            for tag, start in _fields(datagram):
                 if tag == self.name[1] << 3 | LEN:
-                    text = datagram[read_varint(datagram, start)[1] : position]
-        except IndexError:
-            pass  # as above
+                    size, begin = read_varint(datagram, start)
+                    text = datagram[begin : begin + size]
         _, number = self.cases.get(text.decode(errors="replace"), ("", 0))
         return [number] if number in numbers else []
 
