@@ -16,7 +16,7 @@ from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.settings import EnvelopeSettings
 from router.types.lock_file import read_lock
-from router.types.model import Enum, MessageType
+from router.types.model import Enum, MessageType, snake_case
 from router.types.protobuf import Envelope, ProtoSchema, load_protos
 
 SCALARS = {
@@ -116,7 +116,6 @@ _OF_C = frozenset(
 """Rejected as names, since boards and ROS nodes are compiled from the same declarations."""
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
-_WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 _LARGEST_NUMBER = (1 << 29) - 1
 _OF_PROTOBUF = range(19_000, 20_000)
@@ -218,7 +217,7 @@ def _case(name: str, board: str) -> str:
         better = rest[:1].upper() + rest[1:]
         example = better if _MESSAGE_NAME.fullmatch(better) else "RadiationInfo"
         raise UsageError(f"'{name}' is not a valid name for a message of {board}", f"write it as {prefix}{example}")
-    return _WORD_BORDER.sub("_", rest).lower()
+    return snake_case(rest)
 
 
 def _check_names(name: str, case: str, site: Site) -> None:

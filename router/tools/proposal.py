@@ -12,7 +12,7 @@ from enum import IntEnum
 from router.errors import UsageError, did_you_mean
 from router.table.compose import resolve, surprise
 from router.types.lock_file import LOCK_NAME
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, snake_case
 from router.types.protobuf import ProtoSchema
 
 _MOST_NUMBERS = 16
@@ -29,8 +29,6 @@ _WIDTH = 120
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./+-]+")
 """Text that needs no quotation marks in YAML, if it is not a number or the like."""
-
-_WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 
 class Choice(IntEnum):
@@ -182,7 +180,7 @@ def _candidate(message: MessageType, roots: Sequence[MessageType]) -> Candidate:
     if len(optional) > 1 and 2 * len(optional) > len(message.fields):
         cases = ", ".join(member.name for member in optional)
         return Candidate(message, Choice.CASES, {"cases": f"[{cases}]"}, _payloads(optional))
-    case = _WORD_BORDER.sub("_", message.short_name).lower()
+    case = snake_case(message.short_name)
     return Candidate(message, Choice.WHOLE, {"case": case}, {case: message})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Union
@@ -152,6 +153,14 @@ class MessageType:
 
     def __repr__(self) -> str:
         return f"MessageType({self.name!r}, {len(self.fields)} fields)"
+
+
+def snake_case(name: str) -> str:
+    """Return `radiation_info` for `RadiationInfo`."""
+    return _WORD_BORDER.sub("_", name).lower()
+
+
+_WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 
 Type = Union[Bool, Int, Float, String, Bytes, Enum, List, MessageType]
