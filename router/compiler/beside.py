@@ -18,7 +18,7 @@ from router.compiler.constants import fields_of
 from router.compiler.expressions import ExpressionError, check
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import UINT64, FloatKind
-from router.compiler.expressions.tree import ENVELOPE, Binary, Constant, Node, Operator, Variable, walk
+from router.compiler.expressions.tree import ENVELOPE, Binary, Constant, Node, Operator, Variable, nodes_in
 from router.compiler.mapping import Row, build
 from router.compiler.plan import Plan, Record, Unset
 from router.declared import BesideEncoding, BesideValue, Op
@@ -125,7 +125,7 @@ class _Set:
             node = check(expression, replace(self.lookup.scope(_NOTHING, names=names), given=()))
         except ExpressionError:
             return None
-        if not any(isinstance(each, Variable) for each in walk(node)):
+        if not any(isinstance(each, Variable) for each in nodes_in(node)):
             return None
         value = _simple(node)
         if value is None:

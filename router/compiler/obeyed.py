@@ -5,7 +5,7 @@ from __future__ import annotations
 from router.compiler.compiled_table import ObeyedPlan
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.expressions.kinds import BoolKind
-from router.compiler.expressions.tree import Present, Read, walk
+from router.compiler.expressions.tree import Present, Read, nodes_in
 from router.compiler.lookup import Lookup
 from router.errors import Code, Located
 from router.table.model.routes import ANY, Deadman, Obeyed, Route
@@ -29,7 +29,7 @@ def check_obeyed(lookup: Lookup, route: Route) -> ObeyedPlan | None:
     when = lookup.value(obeyed.when, lookup.received(case), (BoolKind,), "'obeyed' takes a bool", hint)
     if when is None:
         return None
-    if not any(isinstance(node, (Read, Present)) for node in walk(when)):
+    if not any(isinstance(node, (Read, Present)) for node in nodes_in(when)):
         message = f"this reads no field of '{case.name}', so it shows nothing about the board"
         lookup.report(when.span, Code.BAD_VALUE, message, "compare a field that says how fast the motors turn")
         return None

@@ -29,7 +29,7 @@ MOST_FETCHED_BYTES = 2 * MOST_LATCHED_BYTES
 """Maximum bytes of fetched messages of all topics, and of the frames made from them."""
 
 POLL_S = 0.02
-QUIET_S = 0.1
+QUIET_S = 0.3
 """Publishers have delivered everything when no latched message has arrived for this long."""
 
 PATIENCE_S = 2.0

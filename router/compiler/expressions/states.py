@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, Variable, walk
+from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, Variable, nodes_in
 
 
 def states_in(conditions: Iterable[Node | None]) -> list[str]:
     """Return the names of the states that conditions read, each once."""
-    nodes = (node for condition in conditions if condition is not None for node in walk(condition))
+    nodes = (node for condition in conditions if condition is not None for node in nodes_in(condition))
     return list(dict.fromkeys(name for node in nodes if (name := _state(node)) is not None))
 
 
@@ -38,5 +38,5 @@ def reads_message(node: Node) -> bool:
     """Return whether a condition depends on the message."""
     return any(
         isinstance(each, (Read, Present)) or (isinstance(each, Variable) and _state(each) is None)
-        for each in walk(node)
+        for each in nodes_in(node)
     )

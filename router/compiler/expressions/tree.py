@@ -234,11 +234,11 @@ def parts_of(node: Node) -> Iterator[Node]:
         yield from _nodes_of(getattr(node, field.name))
 
 
-def walk(node: Node) -> Iterator[Node]:
+def nodes_in(node: Node) -> Iterator[Node]:
     """Yield a node and all nodes in it."""
     yield node
     for part in parts_of(node):
-        yield from walk(part)
+        yield from nodes_in(part)
 
 
 def _nodes_of(value: object) -> Iterator[Node]:

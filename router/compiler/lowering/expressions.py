@@ -246,7 +246,7 @@ def _can_be_kept(node: tree.Node) -> bool:
 
 def _variables(node: tree.Node) -> Iterator[str]:
     """Return the names of all variables that a node reads."""
-    return (each.name for each in tree.walk(node) if isinstance(each, tree.Variable))
+    return (each.name for each in tree.nodes_in(node) if isinstance(each, tree.Variable))
 
 
 def _is_unchecked(holder: Section, member: Field, kind: Kind) -> bool:
