@@ -60,7 +60,8 @@ def test_commands_that_feed_a_deadman_are_actions_and_all_that_it_does(site: Sit
     braked = Action(0, "braked", "manual_drive", "basestation", data=BRAKE)
     sent = braked._replace(what="sent", data=DRIVE)
     tripped, released = Action(0, "tripped", "manual_drive"), Action(0, "released", "manual_drive")
-    assert seen == [sent, tripped, braked, released, sent, braked]  # the last one at the end
+    assert seen[:5] == [sent, tripped, braked, released, sent]
+    assert seen[5:] in ([braked], [tripped, braked, braked])  # at the end, which may be later than the timeout
 
 
 def test_a_client_who_feeds_his_deadman_is_an_action(site: Site) -> None:
