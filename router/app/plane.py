@@ -17,7 +17,7 @@ from time import monotonic, sleep
 from router.app.change import Change
 from router.app.counts import ThreadCounts
 from router.carrier.client_deadmen import ClientDeadmen, await_receipt
-from router.carrier.events import DeadmanEvents, EventReader, EventThread, StateChange
+from router.carrier.events import DeadmanEvents, EventReader, EventThread, StateChange, content_of
 from router.carrier.forwarding import FIRST_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.loading import LoadedImage
@@ -142,6 +142,13 @@ class Plane:
     def stalled(self) -> Iterator[tuple[str, float]]:
         """Return the topics on which native threads are publishing now, each with the seconds since the call began."""
         return filter(None, (self._publishing.stalled(), self._client_deadmen.stalled()))
+
+    def state_texts(self) -> Iterator[tuple[tuple[str, str], int]]:
+        """Yield the name and the present value of each state that is a text, with 1."""
+        if (now := self.now) is not None:
+            for state, content in zip(now.program.states, now.image.states(boottime_ns()), strict=False):
+                if state.is_text:
+                    yield (state.name, str(content_of(content, state.is_text))), 1
 
     def start_reporting(self) -> None:
         """Start to report events, and to signal that Python is alive. All receivers of events must be complete."""

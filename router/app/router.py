@@ -285,6 +285,7 @@ class Router:
             ],
             "listener_waiting": lambda: [((name,), each.lacks_network()) for name, each in self.listeners.items()],
             "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
+            "state_text": self._runtime.plane.state_texts,
             "topic_subscribers": self._runtime.topics.subscribers,
             "type_incompatible": self._runtime.topics.type_incompatible,
             "other_routers": self._runtime.topics.other_routers,

@@ -23,6 +23,7 @@ from router.declared import (
     LostEvent,
     Reason,
     ReturnedEvent,
+    StateContent,
     StateEvent,
 )
 from router.image.names import Names
@@ -53,8 +54,8 @@ class StateChange:
     """The value of a state has changed. `source` has set it; None if it has expired, or by a reload."""
 
     state: str
-    before: int
-    after: int
+    before: int | str
+    after: int | str
     source: str | None
 
 
@@ -102,7 +103,8 @@ class EventReader:
         if kind == EventKind.STATE:
             changed = StateEvent.from_buffer(record)
             source = self._name(changed.source) if changed.source != NO_NAME else None
-            return StateChange(self._name(changed.state), changed.before, changed.after, source)
+            before, after = (content_of(each, changed.is_text) for each in (changed.before, changed.after))
+            return StateChange(self._name(changed.state), before, after, source)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -236,6 +238,11 @@ class EventThread:
         last[counter] = total, report
         if total > reported:
             self._report(replace(report, times=total - reported))
+
+
+def content_of(content: StateContent, is_text: bool) -> int | str:
+    """Return the value of a state."""
+    return bytes(content.text[: content.number]).decode(errors="replace") if is_text else content.number
 
 
 def _error(number: int) -> OSError | None:

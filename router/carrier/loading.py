@@ -184,6 +184,14 @@ class LoadedImage:
         """Return a pointer to a structure."""
         return ctypes.pointer(kind.from_address(self._base + offset))
 
+    def states(self, now: int) -> list[c.StateContent]:
+        """Return the values of the program's states at `now` (boot clock); none once the image is closed."""
+        objects, program = self._objects, self.program.contents  # `objects` keeps the states open
+        contents = [c.StateContent() for _ in range(program.state_count if objects else 0)]
+        for index, content in enumerate(contents):
+            self._library.state_read(ctypes.byref(program.states[index]), now, ctypes.byref(content))
+        return contents
+
     def ros_routes(self) -> Iterator[tuple[str, ctypes.Array[c.RosRoute], bool]]:
         """Yield the topics from ROS, each with its routes, and whether one of them is urgent."""
         for topic, offset, count, is_urgent in self.image.ros_topics:

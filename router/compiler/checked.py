@@ -112,12 +112,13 @@ class CheckedSubscription:
 class CheckedState:
     """A state, with the value that a message of `case` or `feed` gives it.
 
-    Values are integers, also of bools and enums. `feed` is the topic of a state that has one, without targets.
+    Values are texts, or integers, also of bools and enums. `feed` is the topic of a state that has one, without
+    targets.
     """
 
     declared: State
     value: Node
-    initial: int
+    initial: int | str
     case: PayloadCase | None = None
     feed: CheckedSubscription | None = None
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from router.compiler.expressions.kinds import BoolKind, EnumKind
+from router.compiler.expressions.kinds import BoolKind, EnumKind, StringKind
 from router.compiler.expressions.tree import STATE
 from router.compiler.metrics import Counters
 from router.declared import BesideEncoding, BesideValue
@@ -154,7 +154,7 @@ class DeadmanPlan:
 
 @dataclass(frozen=True, slots=True)
 class StatePlan:
-    """A state: an integer, also for a bool or an enum. `valid_for` is in ns, None for never.
+    """A state: a text, or an integer, also for a bool or an enum. `valid_for` is in ns, None for never.
 
     `setters` are the routes whose messages set it, each with the senders that do, or its label with its topic.
     `readers` are the routes with conditions that read it. `place` computes the value.
@@ -162,7 +162,7 @@ class StatePlan:
 
     name: str
     kind: Kind
-    initial: int
+    initial: int | str
     valid_for: int | None
     setters: Mapping[str, Collection[str]]
     readers: Collection[str]
@@ -179,14 +179,20 @@ class StatePlan:
         return " ".join([str(self.kind), *(f"{name}={number}" for name, number in values)])
 
     @property
+    def is_text(self) -> bool:
+        return isinstance(self.kind, StringKind)
+
+    @property
     def values(self) -> Collection[str] | None:
-        """All values as a table writes them; None for an integer."""
+        """All values as a table writes them; None for an integer or a text."""
         if isinstance(self.kind, EnumKind):
             return [name for name, _ in self.kind.enum.values]
         return ("true", "false") if isinstance(self.kind, BoolKind) else None
 
-    def shown(self, value: int) -> str:
+    def shown(self, value: int | str) -> str:
         """Return a value as a table writes it."""
+        if isinstance(value, str):
+            return repr(value)
         if isinstance(self.kind, EnumKind):
             return next((name for name, number in self.kind.enum.values if number == value), str(value))
         if isinstance(self.kind, BoolKind):

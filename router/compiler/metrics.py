@@ -158,6 +158,7 @@ METRICS = (
         bounds=STOPPING_BOUNDS_NS,
     ),
     Metric("state", "level", ("state",), "The value of a state: an integer, also of a bool or an enum."),
+    Metric("state_text", "number", ("state", "text"), "1 for the present value of a state that is a text."),
     Metric("state_changes", "counter", ("state",), "How often the value of a state changed, also by expiring."),
     Metric(
         "state_set_seconds",

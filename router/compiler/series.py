@@ -120,7 +120,7 @@ def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
 
 
 def _open_state(counters: Counters, plan: StatePlan) -> None:
-    _open(counters, ("state", "state_changes"), plan.name)
+    _open(counters, ("state_changes",) if plan.is_text else ("state", "state_changes"), plan.name)
     for route, sources in plan.setters.items():
         _open_each(counters, "state_set_seconds", plan.name, last=sorted(sources))
         counters.set_commands(route, plan.label, are_commands=True)  # what it lets pass may be commands

@@ -7,18 +7,19 @@ from dataclasses import replace
 
 from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
 from router.compiler.expressions import Scope
-from router.compiler.expressions.kinds import BoolKind, EnumKind, IntKind, Kind
+from router.compiler.expressions.kinds import BoolKind, EnumKind, IntKind, Kind, StringKind
 from router.compiler.expressions.states import operands_of, reads_message, states_in
-from router.compiler.expressions.tree import Call, Node, constant_of
+from router.compiler.expressions.tree import Call, Node, constant_of, whole
 from router.compiler.lookup import Lookup
 from router.compiler.topics import qos_findings, resolved, stamp_of, topic_name_finding
+from router.declared import MOST_STATE_TEXT
 from router.errors import Code, Diagnostic
 from router.table.model.routes import ANY, Route
 from router.table.model.state import State
 from router.table.model.targets import OnLimit, Topic
-from router.types.model import MessageType
+from router.types.model import MessageType, String
 
-_KINDS = (BoolKind, EnumKind, IntKind)
+_KINDS = (BoolKind, EnumKind, IntKind, StringKind)
 _NOTHING = MessageType("a state")
 """The source message of an initial value: a message without fields."""
 
@@ -72,14 +73,16 @@ def _of_case(lookup: Lookup, declared: State) -> CheckedState | None:
     return CheckedState(declared, *valued, case=case) if valued else None
 
 
-def _valued(lookup: Lookup, declared: State, scope: Scope) -> tuple[Node, int] | None:
+def _valued(lookup: Lookup, declared: State, scope: Scope) -> tuple[Node, int | str] | None:
     """Return what computes the value from a message, and the initial value; None with a finding."""
-    value = lookup.value(declared.value, scope, _KINDS, "a state takes an integer, a bool or an enum")
+    value = lookup.value(declared.value, scope, _KINDS, "a state takes an integer, a bool, an enum or a text")
     initial = _initial(lookup, declared, value.kind, scope) if value is not None else None
     if value is None or initial is None:
         return None
     if isinstance(value.kind, EnumKind):  # conditions would read a number that the enum lacks as "not MANUAL"
         value = Call(value.kind, value.span, "member", (value,))
+    elif isinstance(value.kind, StringKind):
+        value = Call(value.kind, value.span, "fit_text", (value, whole(MOST_STATE_TEXT, value.span)))
     return value, initial
 
 
@@ -99,15 +102,25 @@ def _require_route(lookup: Lookup, declared: State, case: str) -> None:
             return
 
 
-def _initial(lookup: Lookup, declared: State, kind: Kind, scope: Scope) -> int | None:
+def _initial(lookup: Lookup, declared: State, kind: Kind, scope: Scope) -> int | str | None:
     """Return the initial value, None with a finding. `scope` is that of the value, whose constants are visible."""
     scope = replace(scope, message=_NOTHING, given=(), envelope=None)
-    enum = kind.enum if isinstance(kind, EnumKind) else None
+    expected = kind.enum if isinstance(kind, EnumKind) else String() if isinstance(kind, StringKind) else None
     wanted = f"'initial' takes a value of 'state.{declared.name}', which is {kind}"
-    node = lookup.value(declared.initial, scope, (type(kind),), wanted, expected=enum)
-    value = constant_of(node) if node is not None else None
-    if node is None or value is None:
+    node = lookup.value(declared.initial, scope, (type(kind),), wanted, expected=expected)
+    if node is None:
         return None
+    value = constant_of(node)
+    if value is None:
+        message = "'initial' takes a constant, and this is computed"
+        lookup.report(node.span, Code.BAD_VALUE, message, "write the result")
+        return None
+    if isinstance(value, str):
+        if (size := len(value.encode())) > MOST_STATE_TEXT:
+            message = f"the text has {size} bytes; a state takes at most {MOST_STATE_TEXT}"
+            lookup.report(node.span, Code.OUT_OF_RANGE, message, "shorten it")
+            return None
+        return value
     fits = not isinstance(kind, IntKind) or kind.low <= int(value) <= kind.high
     if not fits or (isinstance(kind, EnumKind) and node.kind != kind):
         lookup.report(node.span, Code.TYPE_MISMATCH, f"{wanted}, not {node.kind}")

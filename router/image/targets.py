@@ -15,6 +15,7 @@ from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.layout import Layout
 from router.compiler.lowering.routines import Routines, native_values
 from router.compiler.refusals import DROP_REASON_NAMES
+from router.declared import MOST_STATE_TEXT
 from router.image.boards import Boards
 from router.image.openings import Openings, period
 from router.table.model.targets import OnLimit, TargetKeys
@@ -61,10 +62,11 @@ class TargetWriter:
         self.timers.append(Timer(symbol))
         return c.StateSettings(
             state=symbol,
-            initial=_signed(plan.initial),
+            initial=_content(plan.initial),
             valid_for=c.NEVER if plan.valid_for is None else plan.valid_for,
             id=self.openings.names.number(plan.name),
-            value=counters.index("state", plan.name),
+            is_text=plan.is_text,
+            value=0 if plan.is_text else counters.index("state", plan.name),
             changes=counters.index("state_changes", plan.name),
         )
 
@@ -94,6 +96,7 @@ class TargetWriter:
             column=column,
             source=self.openings.names.number(source),
             age=self.program.counters.index("state_set_seconds", state.name, source),
+            is_text=state.is_text,
         )
 
     def _of_state(self, plan: RoutePlan, state: StatePlan) -> c.Targets:
@@ -242,9 +245,12 @@ class TargetWriter:
         return self._sources
 
 
-def _signed(value: int) -> int:
-    """Return the signed integer with the same 64 bits."""
-    return value - (1 << 64) if value >= 1 << 63 else value
+def _content(value: int | str) -> c.StateContent:
+    """Return the value of a state; a large integer as the signed one with the same 64 bits."""
+    if isinstance(value, str):
+        text = value.encode()
+        return c.StateContent(number=len(text), text=(ctypes.c_uint8 * MOST_STATE_TEXT)(*text))
+    return c.StateContent(number=value - (1 << 64) if value >= 1 << 63 else value)
 
 
 def write_collect(lowered: LoweredCollect, routines: Routines, senders: Sequence[int]) -> c.Collect:

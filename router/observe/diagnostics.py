@@ -18,6 +18,7 @@ from router.observe import problems
 from router.observe.health import PERIOD, HealthSnapshot
 from router.observe.problems import Kind, Problem
 from router.observe.snapshot import Labels
+from router.observe.states import present_value
 from router.observe.watch import Health
 from router.table.model.endpoints import Endpoint
 from router.table.model.routes import Route
@@ -194,7 +195,7 @@ class Report:
 
     def _state(self, state: StatePlan) -> Status:
         """Return the value of a state, and for each sender how long ago it last set the state."""
-        value = state.shown(int(self._health.now.counts("state")[(state.name,)]))
+        value = present_value(state, self._health.now)
         ages = self._health.now.counts("state_set_seconds")
         setters = [(source, age) for (name, source), age in ages.items() if name == state.name]
         values = [

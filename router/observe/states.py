@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from router.compiler.compiled_table import CompiledTable
+    from router.compiler.compiled_table import CompiledTable, StatePlan
     from router.observe.snapshot import Snapshot
 
 
@@ -39,10 +39,16 @@ class StateReading:
 
 def state_readings(program: CompiledTable, now: Snapshot) -> Iterator[StateReading]:
     """Yield the states of a program, in the order of its table."""
-    values = now.counts("state")
     for state in program.states:
         ages = {setter: age for (setter,), age in now.of("state_set_seconds", state.name).items()}
         setter = min(ages, key=ages.__getitem__, default=None)
         age = ages[setter] if setter is not None else None
         is_valid = age is not None and (state.valid_for is None or age <= state.valid_for / 1e9)
-        yield StateReading(state.name, state.shown(int(values[(state.name,)])), setter, age, is_valid)
+        yield StateReading(state.name, present_value(state, now), setter, age, is_valid)
+
+
+def present_value(state: StatePlan, now: Snapshot) -> str:
+    """Return the present value of a state as a table writes it."""
+    if state.is_text:
+        return state.shown(next((text for (text,) in now.of("state_text", state.name)), state.initial))
+    return state.shown(int(now.counts("state")[(state.name,)]))

@@ -28,6 +28,7 @@ METRICS = {kind.metric for kind in Kind} | {
     "state",
     "state_changes",
     "state_set_seconds",
+    "state_text",
     "topic_subscribers",
     *DELIVERED,
 }

@@ -443,7 +443,7 @@ def _state(plan: StatePlan, node: Node) -> Located[str]:
     if plan.values is not None and text not in plan.values:
         message = f"'{text}' is not a value of the state '{plan.name}'"
         raise InvalidValueError(span, Code.BAD_VALUE, message, did_you_mean(text, plan.values))
-    return Located(text, span)
+    return Located(plan.shown(text) if plan.is_text else text, span)
 
 
 def _reasons(node: Node, known: Iterable[str]) -> Counts:

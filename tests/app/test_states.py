@@ -11,6 +11,10 @@ from structlog.testing import capture_logs
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from router.app import Router
+from router.clock import boottime_ns
+from router.observe.snapshot import Counts
+from router.observe.states import state_readings
 from tests.app.conftest import Site
 from tests.repeating import repeating
 from tests.ros.peers import Publisher, wait_until
@@ -85,6 +89,31 @@ def test_a_change_by_a_datagram_that_waited_for_the_start_is_logged_in_words(sit
         wait_until(lambda: router.total("state_changes") == 1)
     [told] = [log for log in logs if log["event"] == "state changed"]
     assert (told["before"], told["after"]) == ("MODE_MANUAL", "MODE_AUTO")
+
+
+def test_a_text_lets_commands_from_ros_pass(site: Site, publisher: Publisher) -> None:
+    of_text = table("state.driver == 'left'").replace(
+        "state:\n", "state:\n  driver: {topic: driver, type: std_msgs/msg/String, value: data, initial: \"'nobody'\"}\n"
+    )
+    named = closing(Publisher("driver", "std_msgs/msg/String"))
+    with capture_logs() as logs, named as names, site.router(of_text) as router:
+        assert publisher.line() == names.line() == "matched"
+        publisher.publish([command(1)])
+        wait_until(lambda: router.total("messages_filtered") == 1)
+        assert texts(router) == {("driver", "nobody"): 1}
+        names.publish([b"\0\1\0\0\5\0\0\0left\0"])
+        wait_until(lambda: router.total("state_changes") == 1)
+        assert texts(router) == {("driver", "left"): 1}
+        [driver, _] = state_readings(router.program, router.read(boottime_ns()))
+        assert (driver.value, driver.setter) == ("'left'", "driver")
+        publisher.publish([command(2)])
+        assert number_of(site.basestation.recv(1000)) == 2
+    [told] = [log for log in logs if log["event"] == "state changed"]
+    assert (told["before"], told["after"]) == ("'nobody'", "'left'")
+
+
+def texts(router: Router) -> Counts:
+    return router.read(boottime_ns()).counts("state_text")
 
 
 def test_a_topic_lets_commands_from_ros_pass(site: Site, publisher: Publisher) -> None:

@@ -151,6 +151,37 @@ def test_messages_of_a_topic_set_a_state(tmp_path: Path) -> None:
     assert states.changes(1) == [StateChange("mode", 3, -1, None)]
 
 
+DRIVER = "mode: {topic: driver, type: std_msgs/msg/String, value: data, initial: \"'nobody'\", valid_for: 5s}"
+
+
+def named(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+def test_a_reload_keeps_a_text_by_name_and_type(tmp_path: Path) -> None:
+    states = States(tmp_path, DRIVER, NO_ROUTE)
+    states.simulation.message("driver", named("the operator on the second floor"), states.simulation.now)
+    assert states.changes(SECOND) == [StateChange("mode", "nobody", "the operator on the second floor", "driver")]
+    states.reload(DRIVER.replace("nobody", "autopilot").replace("5s", "2s"))
+    assert states.changes(SECOND) == []
+    assert states.changes(1) == [StateChange("mode", "the operator on the second floor", "autopilot", None)]
+    states.reload(DRIVER)
+    assert states.changes() == [StateChange("mode", "autopilot", "the operator on the second floor", None)]
+    states.reload(DRIVER.replace("value: data", "value: -len(data)").replace("\"'nobody'\"", "-1"))
+    assert states.count("state") == -1
+    states.reload(DRIVER)
+    assert states.changes() == []
+
+
+def test_a_text_that_is_too_long_is_reported_with_its_place(tmp_path: Path) -> None:
+    states = States(tmp_path, DRIVER, NO_ROUTE)
+    states.simulation.message("driver", named("the operator on the second floor!"), states.simulation.now)
+    [report] = [each.report for each in states.simulation.records() if isinstance(each, CountedReport)]
+    assert (report.target, report.reason) == ("state.mode", "mapping_error")
+    assert report.detail.endswith(": state: 33 bytes, but at most 32 fit")
+
+
 def test_a_message_of_a_topic_counts_from_its_stamp(tmp_path: Path) -> None:
     mode = "mode: {topic: at, type: geometry_msgs/msg/PointStamped, value: trunc(point.x), initial: -1, valid_for: 5s}"
     states = States(tmp_path, mode, NO_ROUTE)

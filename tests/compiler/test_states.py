@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from router.compiler.expressions import ExpressionError, Scope, check
-from router.compiler.expressions.kinds import BoolKind, EnumKind, IntKind, Kind
+from router.compiler.expressions.kinds import BoolKind, EnumKind, IntKind, Kind, StringKind
 from router.compiler.expressions.states import gate_of, reads_message, states_in
 from router.compiler.expressions.tree import Compare, Node, Read, Variable, constant_of, parts_of
 from router.errors import Code
@@ -15,7 +15,12 @@ from router.types.model import Bool, Enum, Field, Int, MessageType
 from tests.compiler.compiling import scope_of, written
 
 MODE = Enum("test.Mode", (("MANUAL", 0), ("AUTO", 1)))
-STATES: dict[str, Kind | None] = {"mode": EnumKind(MODE), "on": BoolKind(), "turns": IntKind(-5, 5)}
+STATES: dict[str, Kind | None] = {
+    "mode": EnumKind(MODE),
+    "on": BoolKind(),
+    "turns": IntKind(-5, 5),
+    "driver": StringKind(),
+}
 PLAIN = MessageType("test.Plain", (Field("speed", Int(32, True)), Field("AUTO", Int(32, True))))
 SCALAR = MessageType("test.Scalar", (Field("state", Int(32, True)),))
 NESTED = MessageType(
@@ -45,6 +50,13 @@ def test_names_beside_a_state_are_values_of_its_enum(text: str, number: int) -> 
     assert states_in([node]) == ["mode"]
     constants = [constant_of(item) for item in _leaves(node)]
     assert number in constants
+
+
+@pytest.mark.parametrize("text", ["state.driver == left", "state.driver in ['left', right]", "left != state.driver"])
+def test_names_beside_a_text_are_told_to_be_quoted(text: str) -> None:
+    with pytest.raises(ExpressionError) as raised:
+        read(text)
+    assert raised.value.diagnostic.hint in {"for text, write 'left' in quotes", "for text, write 'right' in quotes"}
 
 
 def test_a_field_of_that_name_takes_precedence_over_the_value() -> None:
@@ -77,6 +89,7 @@ def test_a_name_of_a_field_and_of_a_state_is_ambiguous() -> None:
         ("state.on and speed > 3 and state.turns > 0", ["on", "turns"]),
         ("(state.on or state.turns > 0) and source == 'a'", ["on", "turns"]),
         ("state.on or speed > 3", []),
+        ("'x' + state.driver == 'xleft' and state.driver != source", ["driver"]),
         ("speed > 3", []),
         ("source == 'a' if state.on else False", []),
     ],

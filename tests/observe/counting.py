@@ -23,6 +23,7 @@ routes:
   manual_drive: {{deadman: {{obeyed: {{drive_diag: abs(front_left_motor.rpm) < 5, within: 2s}}}}}}
 state:
   mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}
+  driver: {{topic: driver, type: std_msgs/msg/String, value: data, initial: "''", valid_for: 1s}}
 gateways:
   dashboard:
     inbound:

@@ -52,7 +52,7 @@ def sim_program() -> CompiledTable:
 class FakeRunning:
     """`failures` has exceptions of the mirror's consumers, `collected` counts reads of the counters.
 
-    `began`: when it was started (boot clock, ns).
+    `began`: when it was started (boot clock, ns). `texts`: states that are texts, where they are not initial.
     """
 
     def __init__(self, program: CompiledTable) -> None:
@@ -69,6 +69,7 @@ class FakeRunning:
         self.waiting: deque[Mirrored] = deque()
         self.acted: deque[Acted] = deque()
         self.counts = program.counters.fresh_counts()
+        self.texts: dict[str, str] = {}
         self.began = boottime_ns()
         self._turns = 0
 
@@ -105,7 +106,7 @@ class FakeRunning:
         computed = {
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
-        } | {"endpoint_stale_after_seconds": self._stale_after}
+        } | {"endpoint_stale_after_seconds": self._stale_after, "state_text": self._state_texts}
         counters, known = self.program.counters, dict.fromkeys(self.program.table.endpoints, self.began)
         return Readings(counters, lambda: [*self.counts, *_LATER], computed, known)
 
@@ -116,6 +117,11 @@ class FakeRunning:
         for endpoint in self.program.table.endpoints.values():
             if endpoint.stale_after is not None:
                 yield (endpoint.name, endpoint.kind.value), endpoint.stale_after / 1e9
+
+    def _state_texts(self) -> Iterator[tuple[tuple[str, str], float]]:
+        for state in self.program.states:
+            if state.is_text:
+                yield (state.name, self.texts.get(state.name, str(state.initial))), 1
 
     def replies(self) -> dict[tuple[str, str], Reply]:
         return self.given_replies

@@ -34,6 +34,7 @@ def test_there_is_a_status_for_the_router_and_each_listener_endpoint_route_gatew
         *(f"route/{route.name}" for route in table.routes),
         "gateway/dashboard",
         "state/mode",
+        "state/driver",
     ]
     assert {status.level for status in told.values()} == {Level.OK}
     assert told["endpoint/sensor_board"].hardware_id == "192.168.0.30:8"
@@ -57,6 +58,16 @@ def test_a_state_is_reported_with_its_age_and_who_set_it(router: Counting) -> No
         "dropped: mapping_error": "2",
         "changes": "3",
     }
+
+
+def test_a_state_that_is_a_text_is_reported_in_quotes(router: Counting) -> None:
+    assert reported(router, 1)["state/driver"].message == "''"
+    router.texts["driver"] = "left"
+    router.count("state_set_seconds", "driver", "driver", to=router.now)
+    status = reported(router, 0.5)["state/driver"]
+    assert status.message == "'left'"
+    values = {"value": "'left'", "initial value": "''", "set by driver": "0.5 s", "changes": "0"}
+    assert dict(status.values) == values
 
 
 def test_the_table_is_reported_by_its_name(router: Counting) -> None:

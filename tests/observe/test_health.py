@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 
 import pytest
 from structlog.testing import capture_logs
@@ -487,12 +488,15 @@ def test_commands_that_a_state_withholds_are_told_as_the_cause_of_the_stop(route
 
 
 def test_a_state_has_its_value_and_who_set_it_how_long_ago(router: Counting) -> None:
-    assert router.look(1).states == (StateReading("mode", "MODE_MANUAL", None, None, is_valid=False),)
+    driver = StateReading("driver", "''", None, None, is_valid=False)
+    assert router.look(1).states == (StateReading("mode", "MODE_MANUAL", None, None, is_valid=False), driver)
     router.count("state", "mode", to=1)
     router.count("state_set_seconds", "mode", "basestation", to=router.now)
-    assert router.look(5).states == (StateReading("mode", "MODE_AUTO", "basestation", 5.0, is_valid=True),)
+    router.texts["driver"] = "left"
+    set_by = StateReading("mode", "MODE_AUTO", "basestation", 5.0, is_valid=True)
+    assert router.look(5).states == (set_by, replace(driver, value="'left'"))
     router.count("state", "mode", to=0)
-    [expired] = router.look(1).states
+    [expired, _] = router.look(1).states
     assert (expired.value, expired.origin) == ("MODE_MANUAL", "last set 6.0 s ago by basestation")
 
 

@@ -52,6 +52,7 @@ LABELS = {
     "name": "drive_motor",
     "node": "/rover_router",
     "state": "served",
+    "text": "AUTO",
     "client": "0",
     "command": "true",
 }

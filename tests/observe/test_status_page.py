@@ -792,6 +792,7 @@ extends: {ROUTES}/sim.yaml
 state:
   mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}
   selected: {{case: object_selection, source: basestation, value: object_id, initial: 0}}
+  driver: {{topic: driver, type: std_msgs/msg/String, value: data, initial: "''"}}
 """
 
 
@@ -803,6 +804,7 @@ def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tm
     running = FakeRunning(program)
     running.count("state", "mode", to=1)
     running.count("state_set_seconds", "mode", "basestation", to=boottime_ns())
+    running.texts["driver"] = "the operator on the second floor"
     with closing(served(running, save)) as server:
         page = open_page(browser, f"http://{server.address}/")
         tiles = page.evaluate("[...document.querySelectorAll('#tiles .state')].map((tile) => tile.textContent)")
@@ -815,6 +817,7 @@ def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tm
     assert [re.sub(r"[\d.]+ s", "N s", tile) for tile in tiles] == [
         "state.modeMODE_AUTOset N s ago by basestation",
         "state.selected0never set",
+        "state.driver'the operator on the second floor'never set",
     ]
     assert found == []
 

@@ -14,8 +14,20 @@
 
 /* ---- states ---- */
 
-static int64_t present_state(const struct machine *machine, int64_t index) {
-    return state_value(machine->layout->states[index].state, machine->env->now(machine->env));
+/* Read the present value of a state into a slot. Return false if there is no room for a text. */
+static bool present_state(struct machine *machine, int64_t index, struct value *slot) {
+    const struct state_settings *settings = &machine->layout->states[index];
+    int64_t now = machine->env->now(machine->env);
+    if (!settings->is_text) {
+        slot->integer = state_number(settings, now);
+        return true;
+    }
+    struct state_content content;
+    uint8_t *text = take_text(machine, MOST_STATE_TEXT);
+    if (!text) return false;
+    state_value(settings, now, &content);
+    *slot = text_of(memcpy(text, content.text, MOST_STATE_TEXT), (size_t)content.number);
+    return true;
 }
 
 /* ---- lists ---- */
@@ -163,7 +175,7 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
         case OP_LOAD: *++top = slots[op->slot]; break;
         case OP_KEEP: slots[op->slot] = *top; break;
         case OP_DROP: top--; break;
-        case OP_STATE: slots[op->slot].integer = present_state(machine, op->integer); break;
+        case OP_STATE: WANT(present_state(machine, op->integer, &slots[op->slot]));
 
         case OP_ADD: top--; top->bits += top[1].bits; break;
         case OP_SUBTRACT: top--; top->bits -= top[1].bits; break;

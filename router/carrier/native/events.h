@@ -52,10 +52,19 @@ struct returned_event {
     int64_t silence;     /* ns */
 };
 
+enum { STATE_WORDS = 4, MOST_STATE_TEXT = STATE_WORDS * 8 }; /* bytes of a text */
+
+/* The value of a state: a number, or a text of `number` bytes with zeros after them. */
+struct state_content {
+    int64_t number;
+    uint8_t text[MOST_STATE_TEXT];
+};
+
 struct state_event {
     uint32_t size, kind;    /* EVENT_STATE: the value of a state has changed */
     uint32_t state, source; /* `source`: the sender that set it, or NO_NAME: it has expired, or a reload has changed it */
-    int64_t before, after;
+    uint32_t is_text, reserved;
+    struct state_content before, after;
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

@@ -70,7 +70,7 @@ enum op {
     OP_LOAD,    /* pushes the value in `slot` */
     OP_KEEP,    /* copies the top value to `slot` */
     OP_DROP,    /* pops a value */
-    OP_STATE,   /* copies the present value of the layout's state `integer` to `slot` */
+    OP_STATE,   /* copies the present value of the layout's state `integer` to `slot`, and a text to the machine's buffer */
     /* Integers. `flag` (enum sign) says which operands are unsigned, and whether the result is. The plain operations wrap
      * around at 2^64, and are for results that always fit. The CHECKED ones, and division, refuse a result that does not: */
     OP_ADD,

@@ -16,11 +16,11 @@ struct state;
 /* A state as a program declares it. */
 struct state_settings {
     struct state *state;
-    int64_t initial;
+    struct state_content initial;
     int64_t valid_for; /* ns, or NEVER if the value does not expire */
     uint32_t id;       /* in events */
-    uint32_t value, changes; /* counters */
-    uint32_t reserved;
+    uint32_t is_text;
+    uint32_t value, changes; /* counters; a text has no `value` */
 };
 
 /* The messages of a route from one sender, or of a topic, that set a state. */
@@ -31,7 +31,7 @@ struct setter {
     uint32_t column; /* of the sender; not for a topic */
     uint32_t source; /* the name of the sender or topic, in events */
     uint32_t age;    /* counter: boot clock */
-    uint32_t reserved;
+    uint32_t is_text;
 };
 
 /* Open a state that was never set. Its first member is a struct timer. Returns NULL if memory runs out. */
@@ -42,10 +42,13 @@ void state_close(struct state *state);
 void states_adopt(struct timers *timers, const struct state_settings *settings, uint32_t count);
 
 /* Set the state to a value, that of a message of `at` (boot clock). Takes the lock. */
-void state_set(struct timers *timers, const struct setter *setter, int64_t value, int64_t at);
+void state_set(struct timers *timers, const struct setter *setter, const struct state_content *value, int64_t at);
 
 /* Do so with the message that the environment's machine has read; `is_read`: without an error. If it has no value, count and
  * report that instead. */
 void set_state(struct thread_env *env, const struct setter *setter, bool is_read, int64_t at, int64_t now);
+
+/* Copy the value at `now` (boot clock). Any thread may call it while it has the program of these settings. */
+void state_read(const struct state_settings *settings, int64_t now, struct state_content *value);
 
 #endif

@@ -34,7 +34,7 @@ from router.compiler.expressions.tree import Call, Constant, Node, Operator, con
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.table.model.expressions import Choices, Expression
 from router.table.nodes import TextSpan
-from router.types.model import List, Type
+from router.types.model import List, String, Type
 
 DEEPEST = 60
 """Maximum nesting of an expression: functions on syntax trees are recursive, both ours and Python's."""
@@ -208,11 +208,13 @@ class _Checker:
 
     def _compared(self, operands: Sequence[ast.expr]) -> list[Node]:
         """Check the operands of a comparison. Beside a state with an enum, bare names are values of the enum."""
-        states = [state for each in operands if (state := state_named(each, self.text, self.scope))]
-        enum = next((state.kind.enum for state in states if isinstance(state.kind, EnumKind)), None)
-        if enum is None:
+        kinds = [state.kind for each in operands if (state := state_named(each, self.text, self.scope))]
+        scalar: Type | None = next((kind.enum for kind in kinds if isinstance(kind, EnumKind)), None)
+        if scalar is None and any(isinstance(kind, StringKind) for kind in kinds):
+            scalar = String()
+        if scalar is None:
             return [self.check(operand) for operand in operands]
-        expected: Mapping[type[ast.expr], Type] = {ast.Name: enum, ast.List: List(enum)}
+        expected: Mapping[type[ast.expr], Type] = {ast.Name: scalar, ast.List: List(scalar)}
         return [self.check(operand, expected.get(type(operand))) for operand in operands]
 
     def _beside_null(self, node: ast.Compare) -> ast.expr | None:

@@ -76,7 +76,8 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
         return _no_constant(text, span, _of_an_enum(text, scope, expected), expected)
     if isinstance(expected, String):
         close = one_of(_ways(scope, (text,))) or (f"did you mean '{near}'?" if (near := nearest(text, known)) else "")
-        hint = f"{close} for text, write {{text: {text}}}".strip()
+        literal = f"'{text}' in quotes" if scope.reads_states else f"{{text: {text}}}"
+        hint = f"{close} for text, write {literal}".strip()
         return ExpressionError(span, Code.UNKNOWN_FIELD, message, hint)
     hint = (
         _of_an_enum(text, scope, expected)
@@ -111,6 +112,8 @@ def _no_constant(text: str, span: SourceSpan, hint: str, expected: Type | None) 
     """Return the error for a name in a message of constants."""
     example = f"{expected}.{expected.values[0][0]}" if isinstance(expected, Enum) else "0"
     message = f"'{text}' is not a constant"
+    if isinstance(expected, String):
+        hint = f"quote a text twice: \"'{text}'\""
     return ExpressionError(
         span,
         Code.UNKNOWN_FIELD,

@@ -9,8 +9,22 @@ from router.compiler.expressions.tree import STATE, Logic, Node, Present, Read, 
 
 def states_in(conditions: Iterable[Node | None]) -> list[str]:
     """Return the names of the states that conditions read, each once."""
+    return [state_name(state) for state in state_variables(conditions)]
+
+
+def state_variables(conditions: Iterable[Node | None]) -> list[Variable]:
+    """Return the states that conditions read, each once."""
     nodes = (node for condition in conditions if condition is not None for node in nodes_in(condition))
-    return list(dict.fromkeys(name for node in nodes if (name := _state(node)) is not None))
+    by_name: dict[str, Variable] = {}
+    for node in nodes:
+        if isinstance(node, Variable) and _is_state(node):
+            by_name.setdefault(node.name, node)
+    return [*by_name.values()]
+
+
+def state_name(state: Variable) -> str:
+    """Return the name of a state that a condition reads, without `state.`."""
+    return state.name.removeprefix(f"{STATE}.")
 
 
 def gate_of(conditions: Iterable[Node | None]) -> list[Node]:
@@ -27,16 +41,13 @@ def operands_of(conditions: Iterable[Node | None]) -> Iterator[Node]:
             yield condition
 
 
-def _state(node: Node) -> str | None:
-    """Return the name of the state that a node reads, None for other nodes."""
-    if not isinstance(node, Variable) or not node.name.startswith(f"{STATE}."):
-        return None
-    return node.name.removeprefix(f"{STATE}.")
+def _is_state(variable: Variable) -> bool:
+    return variable.name.startswith(f"{STATE}.")
 
 
 def reads_message(node: Node) -> bool:
     """Return whether a condition depends on the message."""
     return any(
-        isinstance(each, (Read, Present)) or (isinstance(each, Variable) and _state(each) is None)
+        isinstance(each, (Read, Present)) or (isinstance(each, Variable) and not _is_state(each))
         for each in nodes_in(node)
     )

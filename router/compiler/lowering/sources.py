@@ -10,7 +10,7 @@ from google.protobuf.descriptor import Descriptor
 from router.compiler.checked import CheckedOrder, CheckedRoute, CheckedState, CheckedSubscription, Target
 from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import UINT32, StringKind
-from router.compiler.expressions.states import gate_of, states_in
+from router.compiler.expressions.states import gate_of, state_name, state_variables
 from router.compiler.lowering import lists
 from router.compiler.lowering.cdr import cdr_message
 from router.compiler.lowering.expressions import Lowering
@@ -32,7 +32,16 @@ from router.compiler.lowering.protobuf import protobuf_fields, protobuf_message
 from router.compiler.lowering.sections import Section
 from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
-from router.declared import MAX_DATAGRAM, MOST_LOOPS, MOST_OPEN, MOST_SECTIONS_DEEP, MOST_STACKED, NONE, Op
+from router.declared import (
+    MAX_DATAGRAM,
+    MOST_LOOPS,
+    MOST_OPEN,
+    MOST_SECTIONS_DEEP,
+    MOST_STACKED,
+    MOST_STATE_TEXT,
+    NONE,
+    Op,
+)
 from router.errors import SourceSpan
 from router.table.model.routes import Route
 from router.types.model import MessageType
@@ -80,19 +89,22 @@ class _Source:
         given = [condition for condition in conditions if condition is not None]
         if not given:
             return (), ""
-        read = [self._state(lowering, name) for name in states_in(given)]
+        read = [self._state(lowering, state) for state in state_variables(given)]
         routine = (*read, *chained(Op.AND, [lowering.value(condition) for condition in given]))
         _require_small([(operation, given[-1].span) for operation in routine])
         if is_bounded:
             _require_fast(routine, given[-1].span, "a destination's `when`")
         return routine, ", or ".join(f"{condition.span}: when" for condition in given)
 
-    def _state(self, lowering: Lowering, name: str) -> Operation:
+    def _state(self, lowering: Lowering, state: tree.Variable) -> Operation:
         """Return the operation that reads a state for a condition, which then sees a single value of it."""
-        slot = Slot(0, f"{tree.STATE}.{name}")
+        is_text = isinstance(state.kind, StringKind)
+        slot = Slot(b"" if is_text else 0, state.name)
         self.temporaries.append(slot)
         lowering.names.variables[slot.name] = slot
-        return Operation(Op.STATE, slot, number=self.states.index(name))
+        if is_text:
+            lowering.names.count_text(MOST_STATE_TEXT, state.span)
+        return Operation(Op.STATE, slot, number=self.states.index(state_name(state)))
 
     def _number(self, node: tree.Node) -> Routine:
         routine = self.lowering().value(node)

@@ -24,16 +24,18 @@ class State:
     name: str
     span: SourceSpan
     value: Expression
-    """An expression over the message that gives an integer, a bool or an enum. A message for which it has no value, or
-    a number that the enum does not name, leaves the state unchanged and is counted as dropped.
+    """An expression over the message that gives an integer, a bool, an enum or a text of at most 32 bytes. A message
+    for which it has no value, a number that the enum does not name, or a longer text leaves the state unchanged and is
+    counted as dropped.
 
     Example: mode
     """
     initial: Annotated[Expression, Shape("constant")]
     """The value until a message sets it, and again when none has for 'valid_for': a constant, for an enum the name of a
-    value. Write the one that stops the rover.
+    value, for a text the text in quotes of its own. Write the one that stops the rover.
 
     Example: MODE_MANUAL
+    Example: "'MANUAL'"
     """
     case: Located[str] | None = None
     """The payload case whose messages set it. A route takes them, or the state never changes.
