@@ -31,7 +31,10 @@ TABLE = (
     Section("Foxglove", "foxglove", "properties.foxglove"),
     Section("Reload", "reload", "properties.reload"),
     Section("Defaults", "defaults", "definitions.defaults"),
-    Section("Listeners", "listen.NAME", "definitions.listener"),
+    Section("Listeners", "listen.NAME", "definitions.listener.else"),
+    Section("Serial lines", "listen.NAME", "definitions.listener.then"),
+    Section("Framing", "listen.NAME.framing", "definitions.stream_framing.else"),
+    Section("Checksum", "listen.NAME.checksum", "definitions.checksum.else"),
     Section("Endpoints", "endpoints.NAME", "definitions.endpoint"),
     Section("States", "state.NAME", "definitions.state"),
     Section("Routes", "routes.CASE", "definitions.route"),
@@ -77,6 +80,10 @@ UNITS = {
     "list_expression": "expression",
     "condition": "expression",
     "locator": "locator",
+    "listener": "[listener](#listeners) or [serial line](#serial-lines)",
+    "device": "path",
+    "stream_framing": "`cobs`, `slip`, `hdlc`, `varint` or [framing](#framing)",
+    "checksum": "name or [checksum](#checksum)",
     "topic_pattern": "[patterns](#patterns-of-topics)",
     "constants": "fields with constants",
 }
@@ -216,8 +223,11 @@ class SchemaPage:
         yield "", ["version", *complete["complete"]["else"]["required"]]
         for key in ("envelope", "http", "record", "foxglove"):
             yield f"properties.{key}", rules[key]["required"]
-        for key, definition in (("listen", "listener"), ("endpoints", "endpoint"), ("state", "state")):
-            yield f"definitions.{definition}", rules[key]["additionalProperties"]["required"]
+        listener = rules["listen"]["additionalProperties"]
+        yield "definitions.listener", [*listener["if"]["required"], *listener["then"]["required"]]
+        yield "definitions.listener.else", listener["else"]["required"]
+        yield "definitions.endpoint", rules["endpoints"]["additionalProperties"]["required"]
+        yield "definitions.state", rules["state"]["additionalProperties"]["required"]
         route, gateway = complete["complete_route"]["else"], complete["complete_gateway"]["else"]
         yield "definitions.route", route["required"]
         yield "definitions.deadman", route["properties"]["deadman"]["else"]["required"]

@@ -126,7 +126,14 @@ class Plane:
         self._acted = ActionRing(forwarding.acted, self._names)
         reader = EventReader(self._names, self._why_rejected, self._superseded, self._where_refused)
         self._events = EventThread(
-            threads, reader, reporter.report, of_deadmen, reporter.returned, self._state_changed, self._pulse
+            threads,
+            reader,
+            reporter.report,
+            of_deadmen,
+            reporter.returned,
+            reporter.link_changed,
+            self._state_changed,
+            self._pulse,
         )
 
     @property
@@ -325,6 +332,8 @@ class Plane:
         """Send what is held back, then have deadmen of routes send a last time. Nothing is sent afterwards."""
         self._deadmen.end()
         if self.has_stopped and self._has_stopped_ros:  # else their threads use what would be freed
+            if self.image is not None:
+                self.image.stop_links()
             self._events.close()
             self._threads.close()
 

@@ -36,7 +36,7 @@ from router.observe.running import ReloadResult, Running
 from router.observe.snapshot import SERIES, Snapshot
 from router.recording.mirror import Mirror
 from router.startup_image.head_start import HeadStart
-from router.table.addresses import Address
+from router.table.addresses import Address, SerialPlace
 from router.table.model.settings import HOW_TO_KEEP
 from router.threads import DaemonThread, StopStack, background_threads
 
@@ -145,8 +145,10 @@ class Router:
         logger.info("router stopped", **self.totals())
 
     def _address_of(self, name: str) -> Address | None:
+        """Return the UDP address of an endpoint."""
         endpoint = self.program.table.endpoints.get(name)
-        return endpoint.address.value if endpoint else None
+        address = endpoint.address.value if endpoint is not None else None
+        return None if isinstance(address, SerialPlace) else address
 
     @property
     def program(self) -> CompiledTable:

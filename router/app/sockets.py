@@ -1,4 +1,7 @@
-"""The UDP sockets of the running program; sockets that the next program also uses stay open."""
+"""The UDP sockets of the running program; sockets that the next program also uses stay open.
+
+Its image opens serial lines.
+"""
 
 from __future__ import annotations
 
@@ -117,11 +120,11 @@ class Sockets:
         """Open the sockets that are not open yet. Raises StartError or OSError."""
         program = change.program
         with ExitStack() as opening:
-            listeners = {plan.name: self._listener(plan, opening) for plan in program.listeners}
+            listeners = {plan.name: self._listener(plan, opening) for plan in program.table.sockets}
             senders: dict[str, NativeSender] = {}
             moves = []
             every = [each.opened for each in (*self._bound.values(), *listeners.values())]
-            for to in program.senders:
+            for to in program.udp_senders:
                 name = sent_from(program.table, to)
                 source = placed(listeners.get(name) if name is not None else None, listeners.values())
                 beside = source.opened if source is not None else None
@@ -171,7 +174,7 @@ class Sockets:
 
     def adopt(self, change: Change) -> None:
         """Send and receive through the sockets of the change."""
-        sockets, plans = change.sockets, {plan.name: plan for plan in change.program.listeners}
+        sockets, plans = change.sockets, change.program.table.listeners
         assert sockets is not None  # noqa: S101 - prepared
         sockets.opened.pop_all()
         for listener in sockets.left:
@@ -187,7 +190,8 @@ class Sockets:
         self.listeners, self._of_head_start = sockets.listeners, []
         self._bound = {plans[name].bound_to: each for name, each in sockets.listeners.items()}
         table = change.program.table
-        self._senders = {to.name: (destination(table, to), sockets.senders[to.name]) for to in change.program.senders}
+        senders = change.program.udp_senders
+        self._senders = {to.name: (destination(table, to), sockets.senders[to.name]) for to in senders}
 
     def finish(self, change: Change) -> None:
         """Close the sockets that only the earlier program used."""

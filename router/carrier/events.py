@@ -20,6 +20,7 @@ from router.declared import (
     DeadmanEvent,
     EventHead,
     EventKind,
+    LinkEvent,
     LostEvent,
     Reason,
     ReturnedEvent,
@@ -60,6 +61,14 @@ class StateChange:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkChange:
+    """A link was opened (`error` is 0), was closed, or cannot be opened (errno)."""
+
+    listener: str
+    error: int
+
+
+@dataclass(frozen=True, slots=True)
 class CountedReport:
     """A loss or a rejection, and the counter of its kind."""
 
@@ -90,7 +99,9 @@ class EventReader:
         self._superseded = superseded
         self._place = place
 
-    def read(self, kind: int, record: memoryview) -> DeadmanEvents | StateChange | Returned | CountedReport:
+    def read(
+        self, kind: int, record: memoryview
+    ) -> DeadmanEvents | StateChange | Returned | LinkChange | CountedReport:
         if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
             return self._of_datagram(record)
         if kind == EventKind.LOST:
@@ -105,6 +116,9 @@ class EventReader:
             source = self._name(changed.source) if changed.source != NO_NAME else None
             before, after = (content_of(each, changed.is_text) for each in (changed.before, changed.after))
             return StateChange(self._name(changed.state), before, after, source)
+        if kind == EventKind.LINK:
+            link = LinkEvent.from_buffer(record)
+            return LinkChange(self._name(link.listener), link.error)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -155,7 +169,8 @@ class EventThread:
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
     that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s),
-    `state_changed` a state that has changed, `of_deadmen` everything else.
+    `link_changed` a link and why it is closed (errno; 0: it is open), `state_changed` a state that has changed,
+    `of_deadmen` everything else.
     """
 
     def __init__(
@@ -165,6 +180,7 @@ class EventThread:
         report: Callable[[Report], None],
         of_deadmen: Callable[[DeadmanEvents], None],
         returned: Callable[[str, float], None],
+        link_changed: Callable[[str, int], None],
         state_changed: Callable[[StateChange], None],
         pulse: Callable[[], None],
     ) -> None:
@@ -173,6 +189,7 @@ class EventThread:
         self._report = report
         self._of_deadmen = of_deadmen
         self._returned = returned
+        self._link_changed = link_changed
         self._state_changed = state_changed
         self._pulse = pulse
         self._stopping = False
@@ -222,6 +239,8 @@ class EventThread:
                 self._returned(endpoint, silence)
             case StateChange() as change:
                 self._state_changed(change)
+            case LinkChange(listener, error):
+                self._link_changed(listener, error)
             case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
             case of_deadman:

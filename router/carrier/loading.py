@@ -51,9 +51,9 @@ _WANTED, _UNWANTED = c.Demand(wanted=c.Wanted.EVERY_MESSAGE), c.Demand()
 class LoadedImage:
     """An image in memory, with the objects that it needs. Threads may execute it as long as it lives.
 
-    `senders` are by endpoint, `timers` is the group of the deadmen of routes, `generation` the number of the program.
-    Objects with the same key are those of the image `before`: then both use the same object, whichever runs. Topics are
-    bound later, by `bind_topics`. Raises MemoryError.
+    `senders` are by endpoint, without those of links; `timers` is the group of the deadmen of routes, `generation` the
+    number of the program. Objects with the same key are those of the image `before`: then both use the same object,
+    whichever runs. Topics are bound later, by `bind_topics`. Raises MemoryError.
     """
 
     def __init__(
@@ -103,6 +103,8 @@ class LoadedImage:
         self, symbol: Symbol, function: str, arguments: tuple[Any, ...], of: tuple[Any, ...], of_clients: bool
     ) -> None:
         """Open an object, or find it in the image before."""
+        if symbol in self._objects:
+            return  # a link that is simulated
         key = symbol, function, self._key(arguments), self._key(of)
         if key not in self._opened:
             self._opened[key] = self._before[key] if key in self._before else self._new(function, arguments)
@@ -162,12 +164,17 @@ class LoadedImage:
                 self._open(*opening)
 
     def bind_listeners(self, listeners: Mapping[str, Listening]) -> None:
-        """Set the sockets of the listeners, by name."""
+        """Set the sockets of the listeners, by name. Those that are links have none."""
         names = [name for name, *_ in self.image.listeners]
         if names:
             array = (c.Listener * len(names)).from_address(self._base + self.image.listener_array)
             for structure, name in zip(array, names, strict=True):
                 structure.fd, structure.keeps_input = listeners[name].socket.fileno(), listeners[name].is_inherited
+
+    def stop_links(self) -> None:
+        """Close the devices of links, after what was sent has left. Nothing can be sent through them afterwards."""
+        for endpoint, _ in self.image.line_ends:
+            self._library.link_stop(self._objects["sender", endpoint].address)
 
     def forget_before(self) -> None:
         """Free what only the image before used, once no thread executes it."""

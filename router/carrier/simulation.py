@@ -9,7 +9,7 @@ from typing import NamedTuple, Union
 from weakref import finalize
 
 from router import declared as c
-from router.carrier.events import CountedReport, DeadmanEvents, EventReader, Returned, StateChange
+from router.carrier.events import CountedReport, DeadmanEvents, EventReader, LinkChange, Returned, StateChange
 from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.compiler.compiled_table import CompiledTable
@@ -41,7 +41,7 @@ class Output(NamedTuple):
     data: bytes
 
 
-Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Returned, CountedReport]
+Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Returned, LinkChange, CountedReport]
 
 
 class Simulation:
@@ -83,6 +83,7 @@ class Simulation:
     def _loaded(self, program: CompiledTable, image: Image, before: LoadedImage | None) -> _Running:
         opened = self._opened
         senders = {name: opened.sender(name, address) for name, address, *_ in image.senders}
+        senders |= {name: opened.sender(name, (device, 0)) for name, device in image.line_ends}
         loaded = LoadedImage(opened.library, image, senders, opened.timers, self._generation, before)
         loaded.bind_topics(dict.fromkeys((topic for topic, _ in image.topics), _TOPIC))
         return _Running(program, loaded)

@@ -11,6 +11,7 @@ from router.compiler.expressions.kinds import BoolKind, EnumKind, StringKind
 from router.compiler.expressions.tree import STATE
 from router.compiler.metrics import Counters
 from router.declared import BesideEncoding, BesideValue
+from router.table.addresses import SerialPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, Inbound
@@ -271,7 +272,19 @@ class CompiledTable:
 
     @property
     def listeners(self) -> tuple[Listener, ...]:
-        return tuple(self.table.listeners.values())
+        """All listeners, first those that are sockets."""
+        return (*self.table.sockets, *self.table.lines)
+
+    @property
+    def line_ends(self) -> Mapping[str, Endpoint]:
+        """The endpoints at the other ends of serial lines, by listener."""
+        ends = {each.listener.value: each for each in self.table.endpoints.values() if each.listener is not None}
+        return {line.name: ends[line.name] for line in self.table.lines}
+
+    @property
+    def udp_senders(self) -> tuple[Endpoint, ...]:
+        """The endpoints that datagrams are sent to."""
+        return tuple(each for each in self.senders if not isinstance(each.address.value, SerialPlace))
 
     @property
     def routes(self) -> Iterator[RoutePlan]:

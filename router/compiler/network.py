@@ -9,9 +9,9 @@ from itertools import combinations
 from typing import TypeAlias
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
-from router.table.addresses import Address
+from router.table.addresses import Address, SerialPlace
 from router.table.model import RouteTable
-from router.table.model.endpoints import EPHEMERAL, Endpoint, EndpointKind
+from router.table.model.endpoints import EPHEMERAL, Endpoint, EndpointKind, Listener
 from router.table.model.gateways import Gateway, Transport
 from router.table.model.routes import ANY
 
@@ -45,6 +45,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     yield from _group_findings(table)
     yield from _several_machines(table)
     yield from _listener_findings(table)
+    yield from _line_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
             message = f"'{endpoint.name}' is not a board, so it receives NaN and infinity anyway"
@@ -59,7 +60,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _local_addresses(table: RouteTable) -> Iterator[_LocalAddress]:
-    for listener in table.listeners.values():
+    for listener in table.sockets:
         interface = listener.interface
         yield _LocalAddress(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
     if table.http is not None:
@@ -89,7 +90,7 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for a gateway that sends to a listener or gateway of this table: messages could loop endlessly."""
-    own = {f"listener '{listener.name}'": listener.address.value for listener in table.listeners.values()}
+    own = {f"listener '{listener.name}'": listener.address.value for listener in table.sockets}
     for other in table.gateways.values():
         if other.receive is not None:
             own["'receive' address" if other is gateway else f"gateway '{other.name}'"] = other.receive.value
@@ -149,16 +150,66 @@ def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
     accepted_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
     if not senders or ANY in sources or None in accepted_by or table.broken:
         return
-    for listener in table.listeners.values():
+    for listener in table.sockets:
         if listener.name not in accepted_by:
             message = f"listener '{listener.name}' accepts none of the sending endpoints, so it rejects everything"
             hint = f"remove it, or give an endpoint 'listener: {listener.name}'"
             yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
 
 
+def _line_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for serial lines that share a device, or do not have one endpoint at their other end."""
+    devices: dict[Address, Listener] = {}
+    for line in table.lines:
+        first = devices.setdefault(line.address.value, line)
+        if first is not line:
+            message = f"listener '{line.name}' uses the device of listener '{first.name}'"
+            yield Diagnostic(
+                line.address.span, Code.ADDRESS_CLASH, message, "name another device: only one of them can open it"
+            )
+        at_its_end = [each for each in table.endpoints.values() if _is_at(each, line)]
+        if not at_its_end and not table.broken:
+            message = f"nobody is at the other end of the serial line '{line.name}'"
+            hint = f"add an endpoint with `listener: {line.name}` and without 'address'"
+            yield Diagnostic(line.span, Code.MISSING_KEY, message, hint)
+        for other in at_its_end[1:]:
+            message = f"'{at_its_end[0].name}' and '{other.name}' are both at the other end of '{line.name}'"
+            yield Diagnostic(
+                other.span, Code.ADDRESS_CLASH, message, "a serial line has one endpoint: remove the other"
+            )
+    for endpoint in table.endpoints.values():
+        yield from _misplaced(table, endpoint)
+
+
+def _misplaced(table: RouteTable, endpoint: Endpoint) -> Iterator[Diagnostic]:
+    """Yield findings for keys of an endpoint that are only for UDP or only for a serial line."""
+    lines = {line.name: line for line in table.lines}
+    if endpoint.send_from is not None and endpoint.send_from.value in lines:
+        message = f"'{endpoint.send_from.value}' is a serial line, so no UDP datagrams leave from it"
+        yield Diagnostic(endpoint.send_from.span, Code.BAD_VALUE, message, "name a listener with an address")
+    if endpoint.listener is None or endpoint.listener.value not in lines:
+        return
+    is_udp = not isinstance(endpoint.address.value, SerialPlace)
+    spans = {
+        "address": endpoint.address.span if is_udp else None,
+        "source_port": endpoint.source_port.span if endpoint.source_port else None,
+        "send_from": endpoint.send_from.span if endpoint.send_from else None,
+    }
+    for key, span in spans.items():
+        if span is not None:
+            message = f"'{endpoint.name}' is at the other end of the serial line '{endpoint.listener.value}'"
+            yield Diagnostic(span, Code.BAD_VALUE, message, f"remove '{key}', which is for UDP")
+
+
+def _is_at(endpoint: Endpoint, listener: Listener) -> bool:
+    return endpoint.listener is not None and endpoint.listener.value == listener.name
+
+
 def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | None:
     """Return a finding if a received datagram could be from either endpoint."""
     if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
+        return None
+    if isinstance(one.address.value, SerialPlace):  # which has a finding, also if neither sends
         return None
     if one.listener and other.listener and one.listener.value != other.listener.value:
         return None
@@ -182,7 +233,7 @@ def loop_finding(
     if endpoint.name in sources:
         message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
-    for listener in table.listeners.values():
+    for listener in table.sockets:
         own = listener.address.value
         returns = endpoint.broadcast is not None and own == (WILDCARD, endpoint.broadcast.value.port)
         if returns or reaches(endpoint.address.value, own):
@@ -200,7 +251,8 @@ def reaches(address: Address, own: Address) -> bool:
 
 
 def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
-    """Return the listener whose address and port datagrams to an endpoint are sent from; None for a separate port.
+    """Return the listener whose address and port datagrams to an endpoint are sent from; None for a separate port. For
+    the other end of a serial line, return that line.
 
     Listeners that differ only in their interfaces share one address and port.
     """
@@ -208,8 +260,16 @@ def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
         return None if endpoint.send_from.value == EPHEMERAL else endpoint.send_from.value
     if endpoint.listener is not None:
         return endpoint.listener.value
-    places = {listener.address.value for listener in table.listeners.values()}
-    return next(iter(table.listeners)) if len(places) == 1 else None
+    places = {listener.address.value for listener in table.sockets}
+    return table.sockets[0].name if len(places) == 1 else None
+
+
+def sent_by(endpoint: Endpoint) -> tuple[str, int]:
+    """Return the address that datagrams of an endpoint come from; on a serial line, 0.0.0.0 and the port 0."""
+    address = endpoint.address.value
+    if isinstance(address, SerialPlace):
+        return WILDCARD, 0
+    return address.host, endpoint.source_port.value if endpoint.source_port else address.port
 
 
 def destination(table: RouteTable, endpoint: Endpoint) -> tuple[tuple[str, int], bool, Cast]:
@@ -242,7 +302,7 @@ def recognisers(
             continue
         if endpoint.address.value.is_name:
             continue
-        host = endpoint.address.value.host
+        host, _ = sent_by(endpoint)
         if endpoint.source_port is not None:
             by_address[host, endpoint.source_port.value] = endpoint.name
         else:

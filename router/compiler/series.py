@@ -69,13 +69,13 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
             (
                 "datagrams_received",
                 "received_bytes",
-                "kernel_drops",
-                "listener_waiting",
                 "datagrams_padded",
                 "superseded_members",
             ),
             listener,
         )
+        is_line = table.listeners[listener].line is not None
+        _open(counters, ("link_up", "link_openings") if is_line else ("kernel_drops", "listener_waiting"), listener)
         if table.listeners[listener].groups:
             _open(counters, ("groups_not_joined",), listener)
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)

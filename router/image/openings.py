@@ -17,6 +17,8 @@ from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, R
 from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
+from router.table.model.endpoints import Listener
+from router.table.model.serial import LENGTHS
 
 if TYPE_CHECKING:
     from router.image.image import Symbol
@@ -50,6 +52,32 @@ class Openings:
     def sequence(self, endpoint: str) -> int:
         """Open the sequence that numbers the router's messages for an endpoint."""
         return self._open(("sequence", endpoint), "sequence_open")
+
+    # links
+
+    def link(self, listener: Listener) -> int:
+        """Open the link of a serial line. It is the sender of the endpoint at the other end."""
+        line = listener.line
+        assert line is not None  # noqa: S101 - checked by the caller
+        framing, checksum = line.framing, line.checksum
+        kind = f"LENGTH_{framing.kind}" if framing.kind in LENGTHS else framing.kind
+        of = "CRC32" if framing.kind == "hdlc" else checksum.kind.name if checksum is not None else "NONE"
+        return self._open(
+            ("sender", self.program.line_ends[listener.name].name),
+            "link_open",
+            self._argument("timers"),
+            line.serial.value.encode(),
+            line.baud,
+            int(c.Parity[line.parity.name]),
+            line.stop_bits,
+            int(c.FramingKind[kind.upper()]),
+            int(c.ChecksumKind[of]),
+            checksum is not None and checksum.is_big_endian,
+            framing.address,
+            self.names.number(listener.name),
+            self.program.counters.index("link_up", listener.name),
+            self.program.counters.index("link_openings", listener.name),
+        )
 
     # targets
 

@@ -24,13 +24,15 @@ from router.image.names import Names
 from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
-from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing
+from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing, Listener
 
 
 def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     """Write the image of a table. It adds to `names`, the names of the process. Equal tables have equal images."""
     names, arrays = names or Names(), Arrays()
     openings = Openings(program, names)
+    for line in program.table.lines:
+        openings.link(line)
     for deadman in program.deadmen:
         openings.deadman(deadman)
     pacers = [Timer(each) for each in openings.pacers()]
@@ -55,11 +57,13 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
         ],
         listeners=[
             (each.name, tuple(each.address.value), each.interface, each.receive_buffer, each.group_hosts)
-            for each in program.listeners
+            for each in program.table.sockets
         ],
         senders=[
-            (each.name, *destination(program.table, each), sent_from(program.table, each)) for each in program.senders
+            (each.name, *destination(program.table, each), sent_from(program.table, each))
+            for each in program.udp_senders
         ],
+        line_ends=[(each.name, each.address.value.host) for each in program.line_ends.values()],
         topics=[(each.label, each.qos.serves_late_joiners) for each in program.publishers],
         openings=[*openings.listed.values()],
         timers=[_timer(each, memory) for each in (*pacers, *targets.timers)],
@@ -115,7 +119,9 @@ class _Writer:
             listener_count=len(self.program.listeners),
             state_count=len(self.program.states),
             states=self.targets.states,
-            listeners=self.arrays.array(c.Listener, [self._listener(*each, protocol) for each in self._framings()]),
+            listeners=self.arrays.array(
+                c.Listener, [self._listener(plan, protocol) for plan in self.program.listeners]
+            ),
             routes=self.arrays.array(c.Route, [self._route(plan) for plan in plans]),
         )
 
@@ -145,16 +151,15 @@ class _Writer:
             for number, name in members
         ]
 
-    def _framings(self) -> Iterator[tuple[str, Framing]]:
-        yield from ((plan.name, plan.framing) for plan in self.program.listeners)
-
-    def _listener(self, name: str, framing: Framing, protocol: ctypes._Pointer[c.Protocol]) -> c.Listener:
+    def _listener(self, plan: Listener, protocol: ctypes._Pointer[c.Protocol]) -> c.Listener:
         """Write a listener, without its socket."""
-        counters, peers = self.counters, list(self._peers(name))
+        counters, name = self.counters, plan.name
+        peers = list(self._peers(name))
         return c.Listener(
             fd=-1,
             id=self.targets.openings.names.number(name),
-            repairs=framing is Framing.ZERO_TRIMMED,
+            repairs=plan.framing is Framing.ZERO_TRIMMED,
+            link=self.targets.openings.link(plan) if plan.line is not None else None,
             protocol=protocol,
             peers=self.arrays.array(c.Peer, peers),
             choices=self.arrays.array(c.Choice, list(self._choices())),

@@ -40,7 +40,7 @@ def clashes(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[Cl
     """Yield the UDP addresses of listeners and gateways with a port of DDS in the domain of the environment."""
     if (domain := _domain(variables)) is None:
         return
-    addresses = [(f"listener '{listener.name}'", listener.address) for listener in program.listeners]
+    addresses = [(f"listener '{listener.name}'", listener.address) for listener in program.table.sockets]
     for name, gateway in program.table.gateways.items():
         addresses += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
     for owner, address in addresses:

@@ -34,6 +34,7 @@ from router.observe.problems import DROPS, Kind, Problem
 from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.observe.states import StateReading, state_readings
+from router.table.addresses import SerialPlace
 from router.table.model.endpoints import EndpointKind
 from router.table.model.routes import ANY
 from router.values.printing import age_text
@@ -88,6 +89,8 @@ REMEDIES: Mapping[str, str] = {
     "read_only": "Remount the disk of `record.directory` writable (`dmesg` says why it is not); the router retries.",
     "no_permission": "Make `record.directory` writable for the user of the router, which retries every 10 s.",
     "disk_error": "The disk of `record.directory` fails: `dmesg` and the log say why; the router retries every 10 s.",
+    "bad_frame": "Check `baud`, `framing` and the wires: what arrives are no frames.",
+    "bad_checksum": "Check `checksum`, and the wires and ground of the line: bytes are changed on the way.",
     "empty": "They are empty: run `router tap --only rejected` to see who sends them.",
     "not_installed": "`router explain {route} --live` shows their types: source their packages, or exclude the topics.",
     "over_limit": "The log names some. Name those that you need in `include`, exclude others, or raise `max_topics`.",
@@ -132,6 +135,9 @@ _OTHER_ADDRESS = (
 )
 _FROM_TOPIC = "Have it send what a route accepts, or write a route for {payload_case} with this `source`."
 _WITHHELD = "They do not meet a condition (`when`) of the table: `router explain {route}` shows it."
+_SILENT_LINE = (
+    "Check its power, and the wires of {address}; compare `baud`, `framing` and `checksum` with its firmware's."
+)
 _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
@@ -197,6 +203,7 @@ class HealthSnapshot:
             self._waiting(),
             self._mistyped(),
             self._other_routers(),
+            self._closed(),
             self._burst(),
             *map(self._above, _GAUGES),
             *map(self._lost, _LOSSES),
@@ -301,6 +308,8 @@ class HealthSnapshot:
             return _OTHER_ADDRESS.format(endpoint=endpoint, address=address, sender=sender)
         if len(self._stale) == len(self._limits) > 1:
             return _ALL_SILENT
+        if isinstance(self.program.table.endpoints[endpoint].address.value, SerialPlace):
+            return _SILENT_LINE.format(address=address)
         return Kind.ENDPOINT_SILENT.remedy.format(address=address)
 
     @property
@@ -413,6 +422,11 @@ class HealthSnapshot:
             more += "".join(f"; both are called {name}" for name in nodes)
             routes = tuple(plan.route for topic in topics for plan in self.program.outbound.get(topic, ()))
             yield self._problem(Kind.OTHER_ROUTER, {"host": host, "process": process}, more, routes)
+
+    def _closed(self) -> Iterator[Problem]:
+        for (name,), is_up in self.now.counts(Kind.LINK_CLOSED.metric).items():
+            if not is_up:
+                yield self._problem(Kind.LINK_CLOSED, {"listener": name})
 
     def _burst(self) -> Iterator[Problem]:
         """Yield routes whose commands may have been stored on their way."""

@@ -66,6 +66,12 @@ class Kind(enum.Enum):
         "Check the name with `getent ahostsv4 {address}`, or give {endpoint} its IP address.",
         "endpoint_unresolved",
     )
+    LINK_CLOSED = (
+        Level.CRITICAL,
+        "the serial line {listener} is closed: nothing is received or sent",
+        "Check plug and power, and who has {address}: `ls -lL {address}`, `fuser -v {address}`; the log says why.",
+        "link_up",
+    )
     DEADMAN_CANNOT_SEND = (
         Level.CRITICAL,
         "the deadman of {route} cannot reach {destination}",

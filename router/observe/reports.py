@@ -10,6 +10,7 @@ from router.clock import boottime_ns
 from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
+from router.net.serial import why_closed
 from router.net.udp import why_not_sent
 from router.table.addresses import Address
 from router.threads import Thread, join_or_abandon
@@ -121,6 +122,18 @@ class Reporter:
     def returned(self, endpoint: str, silence: float) -> None:
         """Log that an endpoint is heard again, after `silence` seconds: for example, a board was reset."""
         logger.warning(f"{endpoint} was silent for {silence:.1f} s and is back", endpoint=endpoint)
+
+    def link_changed(self, listener: str, error: int) -> None:
+        """Log that a serial line was opened (`error` is 0), was closed, or cannot be opened (errno)."""
+        if not error:
+            what = "the serial line is open"
+            self._floods.note(("link opened", listener), logger.info, what, listener=listener)
+            return
+        why, remedy = why_closed(error)
+        what = "the serial line is closed; nothing is received or sent, and the router retries each second"
+        self._floods.note(
+            ("link closed", listener, error), logger.warning, what, listener=listener, why=why, remedy=remedy
+        )
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:
         """Return the last command that was lost within the timeout, or None."""

@@ -14,6 +14,7 @@ from router.compiler import Checked
 from router.compiler.compiled_table import CompiledTable, StatePlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
+from router.compiler.network import sent_by
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields
@@ -158,8 +159,7 @@ class Names:
     def peer(self, name: str, span: SourceSpan) -> Peer:
         """Return the address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
-            address = endpoint.address.value
-            return address.host, endpoint.source_port.value if endpoint.source_port else address.port
+            return sent_by(endpoint)
         host, colon, port = name.partition(":")
         try:
             return parse_address(f"{'127.0.0.1' if host == 'localhost' else host}:{port if colon else _PORT}")

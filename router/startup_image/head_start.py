@@ -57,6 +57,7 @@ class HeadStart:
             each.end_input()
         self.forwarding.threads.stop_receiving()
         self.forwarding.deadmen.end()
+        self.image.stop_links()
         self.forwarding.threads.close()
         self._close_sockets()
 

@@ -33,6 +33,17 @@ class Address(NamedTuple):
         return f"{self.host}:{self.port}"
 
 
+class SerialPlace(Address):
+    """The other end of a serial line, in the place of an address: `host` is the device."""
+
+    @property
+    def is_name(self) -> bool:
+        return False
+
+    def __str__(self) -> str:
+        return self.host
+
+
 _EXAMPLE = "write an IPv4 address and a port, such as 192.168.0.30:8"
 _NO_MULTICAST = "write the address of one machine; for several, an endpoint has `group` or `broadcast` instead"
 _NO_LOCAL_MULTICAST = "write an address of this machine, or 0.0.0.0 for all of them"

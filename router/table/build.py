@@ -18,10 +18,10 @@ from typing import Any, TypeVar, Union
 from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
-from router.table.addresses import LOCAL, REMOTE, Address
+from router.table.addresses import LOCAL, REMOTE, Address, SerialPlace
 from router.table.keys import Key, keys_of
 from router.table.model import Networks, RouteTable
-from router.table.model.endpoints import Endpoint, Listener
+from router.table.model.endpoints import Endpoint, Framing, Listener
 from router.table.model.expressions import Choices, Elements, Expression, FieldEntry, FieldMap
 from router.table.model.gateways import (
     Gateway,
@@ -36,6 +36,7 @@ from router.table.model.gateways import (
     ZenohSettings,
 )
 from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
+from router.table.model.serial import Checksum, ChecksumKind, SerialLine, StreamFraming
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
 from router.table.model.targets import Destination, Topic
@@ -100,6 +101,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         return None
     if (envelope is None or routes is None) and not _has_gateways_only(root):
         return None
+    listeners = builder.each(root, "listen", _listener)
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
     defaults = root.get("defaults")
     if defaults is not None and defaults.broken:
@@ -112,8 +114,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         node=builder.one(root, "node", _node) or NodeSettings(),
         package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
         http=builder.one(root, "http", _server),
-        listeners=builder.each(root, "listen", _named(Listener)),
-        endpoints=builder.each(root, "endpoints", _endpoint),
+        listeners=listeners,
+        endpoints=builder.each(root, "endpoints", lambda entry: _endpoint(entry, listeners)),
         routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
         routes_span=routes.key.span if routes else None,
         gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, Gateway)},
@@ -234,16 +236,47 @@ def _scalar_value(key: Key, node: ScalarNode) -> object:
 # keys of the root
 
 
-def _named(model: type[M]) -> Callable[[Entry], M]:
-    """Return a reader for parts under a name that the table chooses."""
-    return lambda entry: structure(model, mapping(entry.value), name=entry.key.text, span=entry.key.span)
+def _listener(entry: Entry) -> Listener:
+    name, span, settings = entry.key.text, entry.key.span, mapping(entry.value)
+    if "serial" not in settings.entries:
+        return structure(Listener, settings, name=name, span=span)
+    line = structure(SerialLine, settings, span=span)
+    if line.framing.kind == "hdlc" and line.checksum is not None:
+        where = settings.entries["checksum"].key.span
+        raise InvalidValueError(where, Code.BAD_VALUE, "HDLC frames have a CRC-32 of their own", "remove 'checksum'")
+    return Listener(name, span, Located(SerialPlace(line.serial.value, 0), line.serial.span), Framing.EXACT, line=line)
 
 
-def _endpoint(entry: Entry) -> Endpoint:
-    settings = mapping(entry.value)
+def _endpoint(entry: Entry, listeners: Mapping[str, Listener]) -> Endpoint:
+    """Build an endpoint. Without `address`, it is the other end of its listener, a serial line."""
+    name, span, settings = entry.key.text, entry.key.span, mapping(entry.value)
     beside = settings.entries.get("set")
-    given = {"name": entry.key.text, "span": entry.key.span}
-    return structure(Endpoint, settings, **given, beside=_constants(beside) if beside else None)
+    given = {"name": name, "span": span, "beside": _constants(beside) if beside else None}
+    if settings.entries.keys() & {"address", "group", "broadcast"}:
+        return structure(Endpoint, settings, **given)
+    listener = located(settings.get("listener"))
+    known = listeners.get(listener.value)
+    if known is not None and known.line is None:
+        what = f"endpoint '{name}' has no 'address'"
+        raise InvalidValueError(span, Code.MISSING_KEY, what, "write it: only the other end of a serial line has none")
+    place = known.address.value if known is not None else SerialPlace(listener.value, 0)  # which has a finding
+    return structure(Endpoint, settings, **given, unicast=Located(place, listener.span))
+
+
+def _stream_framing(node: Node) -> StreamFraming:
+    if isinstance(node, ScalarNode):
+        return StreamFraming(node.text)
+    ((kind, entry),) = mapping(node).entries.items()
+    if kind == "length":
+        return StreamFraming(scalar(entry.value).text)
+    return StreamFraming(kind, whole(entry.value))
+
+
+def _checksum(node: Node) -> Checksum:
+    if isinstance(node, ScalarNode):
+        return Checksum(ChecksumKind(node.text))
+    ((kind, _),) = mapping(node).entries.items()
+    return Checksum(ChecksumKind(kind), is_big_endian=True)
 
 
 def _state(entry: Entry) -> State:
@@ -570,12 +603,14 @@ def _inbound_deadman(entry: Entry) -> InboundDeadman:
 
 
 _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
+    Checksum: lambda node, _: _checksum(node),
     Destination: _destination,
     Expression: _expression,
     FieldMap: _fields,
     IPv4Network: lambda node, _: _network(node),
     Inbound: _inbound,
     Obeyed: _obeyed,
+    StreamFraming: lambda node, _: _stream_framing(node),
     Topic: _topic,
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,

@@ -194,6 +194,8 @@ def _owners(name: str, path: Path) -> str:
         for owner, schema in definitions.items()
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith(("complete", "elements"))
     ]
+    if path and path[0] == "listen" and "listener" in owners:
+        return "remove it: a listener with 'address' and one with 'serial' have different keys"
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
     named = [_NAMES[owner] for owner in near]
     named += ["the top level"] if name in keys_of(table_schema()) else []
@@ -219,6 +221,8 @@ _NAMES = {
     "qos": "'qos'",
     "state": "a state",
     "listener": "a listener",
+    "stream_framing": "'framing' of a serial line",
+    "checksum": "'checksum' of a serial line",
     "endpoint": "an endpoint",
     "gateway": "a gateway",
     "transport": "'transport'",

@@ -22,6 +22,7 @@ from router.tools.doctor_checks import (
     endpoints,
     extras,
     fine,
+    lines,
     listeners,
     open_domain,
     page,
@@ -56,6 +57,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
         yield from ros_peers(program)
     yield from listeners(program)
     yield from groups(program)
+    yield from lines(program)
     yield from ports(program, running=running is not None)
     yield from ros_ports(program, variables)
     yield from receive_buffers(program)

@@ -24,9 +24,10 @@ from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
+from router.net.serial import why_closed
 from router.net.udp import absence, why_no_way
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
-from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
+from router.table.addresses import LOCATOR, Address, BadAddressError, SerialPlace, parse_address
 from router.table.model.endpoints import Endpoint, Listener, bound_to
 from router.table.model.gateways import Transport
 
@@ -73,9 +74,9 @@ _UNSYNCHRONISED = 0x40
 
 def receive_buffers(program: CompiledTable) -> Iterator[CheckResult]:
     """Check that the kernel grants the receive buffers of the table."""
-    if not program.listeners:
+    if not program.table.sockets:
         return
-    wanted = max(listener.receive_buffer for listener in program.listeners)
+    wanted = max(listener.receive_buffer for listener in program.table.sockets)
     try:
         allowed = int(RMEM_MAX.read_text())
     except FileNotFoundError:  # in a container
@@ -226,7 +227,7 @@ def ports(program: CompiledTable, *, running: bool, with_listeners: bool = True)
     wanted += [("tcp", address.value, None, what, True) for address, what in _pages(program) if address is not None]
     gateways = [(protocol, address, None, what, protocol == "tcp") for protocol, address, what in _gateways(program)]
     wanted += gateways
-    there = [listener for listener in program.listeners if _absence(listener) is None] if with_listeners else []
+    there = [listener for listener in program.table.sockets if _absence(listener) is None] if with_listeners else []
     wanted += [
         ("udp", listener.address.value, listener.interface, f"listener '{listener.name}'", bool(listener.groups))
         for listener in there
@@ -238,7 +239,7 @@ def ports(program: CompiledTable, *, running: bool, with_listeners: bool = True)
 
 def listeners(program: CompiledTable) -> Iterator[CheckResult]:
     """Check that the addresses of listeners, and the network interfaces that they name, are there and up."""
-    for listener in program.listeners:
+    for listener in program.table.sockets:
         about = f"listener '{listener.name}'"
         if (absent := _absence(listener)) is not None:
             why, remedy = absent
@@ -249,6 +250,22 @@ def listeners(program: CompiledTable) -> Iterator[CheckResult]:
         elif listener.interface is not None:
             what = f"{about}: network interface {listener.interface} is down: the listener receives nothing"
             yield warning("listeners", what, f"run `ip link set {listener.interface} up`")
+
+
+def lines(program: CompiledTable) -> Iterator[CheckResult]:
+    """Check that the devices of serial lines are there, and that this user may open them."""
+    for line in program.table.lines:
+        device = line.address.value.host
+        about = f"listener '{line.name}'"
+        if not Path(device).exists():
+            why, remedy = why_closed(errno.ENOENT)
+            yield warning("listeners", f"{about} cannot open {device}: {why}", f"{remedy}; the router waits for it")
+        elif not os.access(device, os.R_OK | os.W_OK):
+            why, remedy = why_closed(errno.EACCES)
+            remedy = remedy.replace("DEVICE", device)
+            yield problem("listeners", f"{about} cannot open {device}: this user may not", remedy)
+        else:
+            yield fine("listeners", f"{about}: {device} is there")
 
 
 def ros_ports(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:
@@ -325,7 +342,7 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
 
 def ways(program: CompiledTable, grade: Callable[[str, str, str], CheckResult]) -> Iterator[CheckResult]:
     """Check that an IP route leads to each endpoint. `grade` makes the result if none does."""
-    for endpoint in program.table.endpoints.values():
+    for endpoint in _on_udp(program):
         address = endpoint.address.value
         if address.is_name:
             continue
@@ -345,7 +362,7 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
     `in_place_of`: by endpoint, another host that sends its payloads.
     """
     yield from ways(program, problem)
-    known = program.table.endpoints.values()
+    known = _on_udp(program)
     one = [endpoint for endpoint in known if endpoint.is_one_machine and _has_way(endpoint)]
     reachable = {endpoint.name: endpoint.address.value.host for endpoint in one}
     try:
@@ -363,6 +380,12 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
         else:
             remedy = "check that it is on and connected; some boards never answer a ping"
             yield warning("endpoints", f"{name}: {host} does not answer a ping", remedy)
+
+
+def _on_udp(program: CompiledTable) -> list[Endpoint]:
+    """Return the endpoints that have an address."""
+    endpoints = program.table.endpoints.values()
+    return [endpoint for endpoint in endpoints if not isinstance(endpoint.address.value, SerialPlace)]
 
 
 def _has_way(endpoint: Endpoint) -> bool:

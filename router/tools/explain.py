@@ -17,7 +17,9 @@ from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPl
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
+from router.compiler.network import sent_by
 from router.compiler.plan import Each, Items, Plan, Record, Unset
+from router.compiler.resolution import with_stand_ins
 from router.compiler.selection import TopicSelector
 from router.compiler.states import sets_state, states_read
 from router.compiler.topics import qos_of, resolved
@@ -43,7 +45,7 @@ from router.table.model.routes import ANY, ROS, Route
 from router.table.model.state import State
 from router.table.model.targets import OnLimit, Topic
 from router.table.units import duration
-from router.tools.udp import LOOPBACK, origin
+from router.tools.udp import LOOPBACK
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.protobuf import PayloadCase
 from router.values.reading import payload
@@ -99,14 +101,16 @@ def tried_route(
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
     """
-    route, case, wire, table = checked.route, checked.case, Wire(program.envelope), program.table
+    route, case, wire = checked.route, checked.case, Wire(program.envelope)
     if not route.sources:
         raise UsageError(f"{route.name} has no 'source'", "--given is for routes that take datagrams")
     message, source = payload(case, words), route.sources[0].value
+    program = with_stand_ins(program)
+    table = program.table
     endpoint = table.endpoints.get(source)
     listener = endpoint.listener.value if endpoint and endpoint.listener else next(iter(table.listeners))
     rehearsal = Rehearsal(program)
-    rehearsal.datagram(listener, origin(source if endpoint else LOOPBACK, table), wire.encode(case, message))
+    rehearsal.datagram(listener, sent_by(endpoint) if endpoint else (LOOPBACK, 0), wire.encode(case, message))
     yield ""
     yield f"  given {shown(case.type, message)} from {source}:"
     happened = [event for event in rehearsal.events if not isinstance(event, Received)]
@@ -514,7 +518,9 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
         "record": table.record,
     }
     parts = {"table": _settings_lines(settings)}
-    parts |= {f"listener {name}": _settings_lines(listener) for name, listener in table.listeners.items()}
+    parts |= {
+        f"listener {name}": _settings_lines(listener.line or listener) for name, listener in table.listeners.items()
+    }
     parts |= {f"endpoint {name}": _settings_lines(endpoint) for name, endpoint in table.endpoints.items()}
     for route in checked.routes:
         parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.errors import TransportError, UsageError, did_you_mean
-from router.table.addresses import Address
+from router.table.addresses import Address, SerialPlace
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable
@@ -52,7 +52,8 @@ def origin(text: str, table: RouteTable | None) -> Address:
     """Parse `HOST[:PORT]`, or an endpoint's name: its host, and its `source_port` if it has one. Raises UsageError."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
-        return Address(located(endpoint.address.value).host, endpoint.source_port.value if endpoint.source_port else 0)
+        address = _of_udp(endpoint.address.value, text)
+        return Address(located(address).host, endpoint.source_port.value if endpoint.source_port else 0)
     host, colon, port = text.partition(":")
     if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
         raise _not_a_place(text, table, "HOST[:PORT]")
@@ -80,7 +81,7 @@ def reachable(address: Address, interface: str | None = None) -> Address:
 
 def listener_address(listener: Listener) -> Address:
     """Return the address that reaches a listener of the table from this computer. Raises UsageError."""
-    return reachable(listener.address.value, listener.interface)
+    return reachable(_of_udp(listener.address.value, listener.name), listener.interface)
 
 
 def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
@@ -145,12 +146,20 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
     if table is None:
         return None
     named = table.endpoints.get(text) or table.listeners.get(text)
-    return None if named is None else located(named.address.value)
+    return None if named is None else located(_of_udp(named.address.value, text))
 
 
 def located(address: Address) -> Address:
     """Return an address with an IPv4 address in place of its host name. Raises UsageError."""
     return address._replace(host=_resolve(address.host)) if address.is_name else address
+
+
+def _of_udp(address: Address, name: str) -> Address:
+    """Return the address of a name of the table. Raises UsageError for a serial line."""
+    if isinstance(address, SerialPlace):
+        what = f"'{name}' is at the serial line {address}, but this works over UDP only"
+        raise UsageError(what, "stop the router, and use a terminal program for the device")
+    return address
 
 
 def _refuse_port_of_name(host: str, text: str, table: RouteTable | None) -> None:

@@ -119,6 +119,12 @@ static void handle(struct carrier *carrier, struct received *received) {
     edition_end(&carrier->edition);
 }
 
+static void reject_frame(struct carrier *carrier, struct received *received, enum reason reason) {
+    edition_begin(&carrier->edition);
+    route_bad_frame(&carrier->routing, received, reason);
+    edition_end(&carrier->edition);
+}
+
 enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
 
 /* Receive and handle a datagram if there is one. */
@@ -148,7 +154,24 @@ static void serve_due(struct carrier *carrier) {
     if (due <= now) timers_serve(carrier->routing.env.timers, now);
 }
 
+/* Read from a link, and handle the frames that are complete. A frame is as old as its first byte. */
+static void receive_frames(struct carrier *carrier, const struct listener *listener) {
+    enum framed framed;
+    size_t length = 0;
+    int64_t began;
+    link_serve(listener->link);
+    while ((framed = link_next(listener->link, carrier->routing.datagram, &length, &began)) != FRAME_PARTIAL) {
+        struct received received = {.listener = listener, .length = length,
+                                    .arrived_at = wall_ns() - (boottime_ns() - began)};
+        if (framed == FRAME_READY) handle(carrier, &received);
+        else reject_frame(carrier, &received, framed == FRAME_BAD ? BAD_FRAME : BAD_CHECKSUM);
+        share_processor(&carrier->share, received.now);
+        serve_due(carrier);
+    }
+}
+
 static void drain(struct carrier *carrier, const struct listener *listener) {
+    if (listener->link) return; /* what waits in a stream is not delivered late */
     for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT) == RECEIVED; left--)
         serve_due(carrier);
 }
@@ -199,12 +222,16 @@ static void receive_from_one(struct carrier *carrier) {
     } while (goes_on(carrier));
 }
 
+static int waited_for(const struct listener *listener) {
+    return listener->link ? link_ready(listener->link) : listener->fd;
+}
+
 /* In each turn receive one datagram from each listener that has any, so that no listener starves the others. */
 static void receive_from_many(struct carrier *carrier, int waiting) {
     const struct program *program = carrier->routing.program;
     for (uint32_t index = 0; index < program->listener_count; index++) {
         struct epoll_event interest = {.events = EPOLLIN, .data.u32 = index};
-        epoll_ctl(waiting, EPOLL_CTL_ADD, program->listeners[index].fd, &interest);
+        epoll_ctl(waiting, EPOLL_CTL_ADD, waited_for(&program->listeners[index]), &interest);
     }
     do {
         struct epoll_event ready[LISTENERS_PER_WAIT];
@@ -213,6 +240,10 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
         bool has_noted = false;
         for (int index = 0; index < count; index++) {
             const struct listener *listener = &program->listeners[ready[index].data.u32];
+            if (listener->link) {
+                receive_frames(carrier, listener);
+                continue;
+            }
             if (ready[index].events & EPOLLERR) has_noted |= sender_note_errors(listener->fd);
             empty += receive_one(carrier, listener, MSG_DONTWAIT) == FOUND_EMPTY;
         }
@@ -220,14 +251,18 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
         if (count >= 0 && empty == count && count < LISTENERS_PER_WAIT) found_empty(carrier);
     } while (goes_on(carrier));
     for (uint32_t index = 0; index < program->listener_count; index++)
-        epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);
+        epoll_ctl(waiting, EPOLL_CTL_DEL, waited_for(&program->listeners[index]), NULL);
+}
+
+static bool has_one_socket(const struct program *program) {
+    return program->listener_count == 1 && !program->listeners->link;
 }
 
 static void *receive_thread(void *of) {
     struct carrier *carrier = of;
     carrier->share.may_be_first = carrier->share.is_first = run_first();
     while (!is_stopping(carrier)) {
-        if (carrier->routing.program->listener_count == 1) receive_from_one(carrier);
+        if (has_one_socket(carrier->routing.program)) receive_from_one(carrier);
         else receive_from_many(carrier, carrier->epoll);
         adopt_next(carrier);
     }

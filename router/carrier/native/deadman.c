@@ -527,6 +527,14 @@ uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t n
     return reached;
 }
 
+void deadmen_send_first(struct timers *timers, const struct sender *sender) {
+    for (struct timer *each = timers->first; each; each = each->next) {
+        if (each->kind != &DEADMAN) continue;
+        struct deadman *deadman = (struct deadman *)each;
+        send_all(timers, deadman, placed(deadman, sender) & (deadman->starts ? deadman->own : deadman->armed));
+    }
+}
+
 void deadman_await_subscribers(struct timers *timers, struct deadman *deadman, int64_t now) {
     pthread_mutex_lock(&timers->lock);
     deadman->greets_until = deadman->starts ? now + START : 0;

@@ -83,6 +83,10 @@ void deadman_close(struct timers *timers, struct deadman *deadman);
  * never heard gets them until there is a command. */
 uint64_t deadman_start(struct timers *timers, struct deadman *deadman, int64_t now);
 
+/* Send, with the lock held, before anything else is sent through a link that has just opened: all deadmen that are armed for its
+ * other end, and all that send at router start. */
+void deadmen_send_first(struct timers *timers, const struct sender *sender);
+
 /* Like `deadman_start`, for a deadman that publishes. It reaches no subscriber that is not discovered yet, so for some
  * time, and until a command is sent, it publishes to each new subscriber: at once, and again after half a second, because
  * subscriber and publisher do not discover each other at the same time and best effort loses messages in between.

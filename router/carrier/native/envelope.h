@@ -12,9 +12,20 @@
 
 enum { MAX_DATAGRAM = 16 * 1024 }; /* bytes; a longer datagram is rejected as TRUNCATED */
 
-/* Reasons to reject a datagram: REJECT_REASONS in compiler/metrics.py. */
-enum reason { TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD, UNKNOWN_CASE, UNHANDLED, IGNORED, SOURCE_MISMATCH };
-enum { REASONS = SOURCE_MISMATCH + 1 };
+/* Reasons to reject a datagram, or a frame of a link: REJECT_REASONS in compiler/metrics.py. */
+enum reason {
+    TRUNCATED,
+    EMPTY,
+    MALFORMED,
+    NO_PAYLOAD,
+    UNKNOWN_CASE,
+    UNHANDLED,
+    IGNORED,
+    SOURCE_MISMATCH,
+    BAD_FRAME,
+    BAD_CHECKSUM
+};
+enum { REASONS = BAD_CHECKSUM + 1 };
 
 struct envelope {
     uint32_t case_number;

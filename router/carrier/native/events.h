@@ -16,7 +16,8 @@ enum event_kind {
     EVENT_DISOBEYED,
     EVENT_EVIDENCE,
     EVENT_RETURNED,
-    EVENT_STATE
+    EVENT_STATE,
+    EVENT_LINK
 };
 
 /* The beginning of every event. */
@@ -65,6 +66,12 @@ struct state_event {
     uint32_t state, source; /* `source`: the sender that set it, or NO_NAME: it has expired, or a reload has changed it */
     uint32_t is_text, reserved;
     struct state_content before, after;
+};
+
+struct link_event {
+    uint32_t size, kind; /* EVENT_LINK: a link was opened, was closed, or cannot be opened */
+    uint32_t listener;
+    int32_t error;       /* errno: why it is closed; 0 if it is open */
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

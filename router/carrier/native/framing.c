@@ -5,7 +5,7 @@
 enum { SLIP_END = 0xC0, SLIP_ESCAPE = 0xDB, SLIP_ESCAPED_END = 0xDC, SLIP_ESCAPED_ESCAPE = 0xDD };
 enum { HDLC_FLAG = 0x7E, HDLC_ESCAPE = 0x7D, HDLC_FLIPPED = 0x20, HDLC_CONTROL = 0x03, HDLC_HEADER = 2 };
 enum { COBS_DELIMITER = 0, COBS_FULL = 0xFF /* the code of a block that no zero follows */ };
-enum { LONGEST_VARINT = 5 };
+enum { LONGEST_LENGTH = 5 };
 
 /* ---- checksums ---- */
 
@@ -75,6 +75,8 @@ void deframer_begin(struct deframer *deframer, const struct framing *framing) {
     deframer->framing = *framing;
     begin_frame(deframer);
 }
+
+bool deframer_is_within(const struct deframer *deframer) { return deframer->has_begun || deframer->code; }
 
 static size_t header_size(const struct framing *framing) { return framing->kind == FRAMING_HDLC ? HDLC_HEADER : 0; }
 
@@ -154,7 +156,7 @@ static enum framed take_escaped(struct deframer *deframer, uint8_t byte) {
 static bool take_length(struct deframer *deframer, uint8_t byte) {
     uint32_t kind = deframer->framing.kind, index = deframer->code++;
     if (kind == FRAMING_VARINT) {
-        deframer->is_bad |= index == LONGEST_VARINT - 1 && byte > 0x0F;
+        deframer->is_bad |= index == LONGEST_LENGTH - 1 && byte > 0x0F;
         deframer->left |= (uint32_t)(byte & 0x7F) << 7 * index;
         return byte < 0x80 || deframer->is_bad;
     }

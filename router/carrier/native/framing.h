@@ -77,6 +77,9 @@ struct deframer {
 /* Begin a stream: forget a partial frame. */
 void deframer_begin(struct deframer *deframer, const struct framing *framing);
 
+/* Whether a frame has begun that is not complete. */
+bool deframer_is_within(const struct deframer *deframer);
+
 /* Take bytes from `*bytes` up to `end`, until a frame is complete, good or bad. `*bytes` is set behind the bytes taken. */
 enum framed deframe(struct deframer *deframer, const uint8_t **bytes, const uint8_t *end);
 

@@ -11,6 +11,7 @@
 #include "deadman.h"
 #include "deliver.h"
 #include "envelope.h"
+#include "link.h"
 #include "order.h"
 #include "state.h"
 
@@ -73,11 +74,12 @@ struct peer {
 };
 
 struct listener {
-    int32_t fd;
+    int32_t fd;  /* -1 for a link */
     uint32_t id; /* in events and mirror records */
     uint32_t repairs;
     uint32_t keeps_input; /* datagrams queued at the stop are left for the next process */
     const struct protocol *protocol;
+    struct link *link; /* NULL for a socket */
     const struct peer *peers; /* by address; for one address, those with a port first */
     const struct choice *choices; /* `columns` for each row; the last one is for strangers */
     uint32_t peer_count, columns;

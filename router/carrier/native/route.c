@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "clock.h"
 #include "collect.h"
 #include "each.h"
 #include "evaluate.h"
@@ -336,6 +337,12 @@ int route_datagram(struct routing *routing, struct received *received) {
     if (reason == ROUTED) reason = route(routing, find_case(protocol, received->envelope.case_number), received);
     if (reason != ROUTED) reject(routing, received, (enum reason)reason);
     return reason;
+}
+
+void route_bad_frame(struct routing *routing, struct received *received, enum reason reason) {
+    received->length = 0; /* there is nothing to show */
+    received->now = boottime_ns();
+    reject(routing, received, reason);
 }
 
 void routing_adopt(struct routing *routing, const struct change *change) {

@@ -31,8 +31,8 @@ struct received {
     /* Set by the caller: */
     const struct listener *listener;
     size_t length;          /* of the datagram, which is cut to MAX_DATAGRAM + 1 bytes */
-    uint32_t address, port; /* of the sender */
-    int64_t arrived_at;     /* wall clock, arrival in the kernel; 0 if unknown */
+    uint32_t address, port; /* of the sender; 0 for a link */
+    int64_t arrived_at;     /* wall clock, arrival in the kernel; 0 if unknown. Of a frame: when its first byte was read */
     int64_t received_at;    /* wall clock */
     int64_t now;            /* boot clock */
     /* Set by `route_datagram`: */
@@ -47,6 +47,9 @@ enum { ROUTED = -1 };
 
 /* Route and deliver the datagram in `routing->datagram`. Return ROUTED, or the reason for rejecting it. */
 int route_datagram(struct routing *routing, struct received *received);
+
+/* Count and report a frame of a link that has no payload: `reason` is BAD_FRAME or BAD_CHECKSUM. */
+void route_bad_frame(struct routing *routing, struct received *received, enum reason reason);
 
 /* Adopt another program between two datagrams: deadmen of the earlier one are passed on, or end. */
 void routing_adopt(struct routing *routing, const struct change *change);

@@ -9,6 +9,8 @@
 #include <string.h>
 #include <sys/socket.h>
 
+#include "link.h"
+
 enum { MOST_ERRORS = 32 }; /* read at once */
 
 static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held only briefly */
@@ -30,6 +32,11 @@ struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port
 void sender_move(struct sender *sender, int fd, int listener) {
     atomic_store(&sender->fd, fd);
     atomic_store(&sender->listener, listener);
+}
+
+void sender_on_link(struct sender *sender, struct link *link) {
+    sender->link = link;
+    sender_move(sender, -1, -1);
 }
 
 void sender_end(struct sender *sender) { sender_move(sender, -1, -1); }
@@ -140,9 +147,11 @@ static int send_from_any_address(struct sender *sender, const void *data, size_t
     return sendmsg(atomic_load(&sender->fd), &message, MSG_DONTWAIT) < 0 ? errno : 0;
 }
 
-/* Retry after an error if it is about an earlier datagram, or if this computer may have lost the socket's address: a brake
+/* Send through the link instead, if the sender has one: so a datagram through a socket does not pay for links.
+ * Retry after an error if it is about an earlier datagram, or if this computer may have lost the socket's address: a brake
  * must then be sent from another one. Return 0 or an errno. */
 static int send_again(struct sender *sender, const void *data, size_t size, int error) {
+    if (sender->link) return link_send(sender->link, data, size, false);
     if (note_own_errors(sender)) error = send_once(sender, data, size);
     bool may_lack_address = (error == EINVAL || error == ENETUNREACH) && atomic_load(&sender->listener) >= 0;
     return may_lack_address ? send_from_any_address(sender, data, size) : error;
@@ -179,6 +188,7 @@ static void note_errors_of(struct sender *sender) {
 }
 
 int sender_send_checked(struct sender *sender, const void *data, size_t size) {
+    if (sender->link) return link_send(sender->link, data, size, true);
     note_errors_of(sender); /* of earlier datagrams, so that they do not count for this one */
     int error = sender_send(sender, data, size);
     if (error == EAGAIN) error = send_beyond_room(sender, data, size);

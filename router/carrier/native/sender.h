@@ -1,4 +1,4 @@
-/* A non-blocking UDP socket for one destination. Any thread may send.
+/* A non-blocking UDP socket for one destination, or a link (link.h). Any thread may send.
  *
  * It is not connected, so that replies reach a listener. It is bound to the address and port of that listener, or to a port
  * chosen by the kernel. ICMP errors about its datagrams reach the listener, or the socket itself if there is no listener or
@@ -12,8 +12,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
+struct link;
+
 struct sender {
     struct sender *next; /* in the list of all senders */
+    struct link *link;   /* NULL for a socket. A link has no socket, so sending through that fails first */
     struct sockaddr_in address;
     _Atomic int fd;       /* -1 after `sender_end` */
     _Atomic int listener; /* the socket of the listener from whose port it sends; -1 for none */
@@ -25,6 +28,9 @@ struct sender {
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
 void sender_close(struct sender *sender); /* when nothing uses it */
+
+/* Make the sender of a link, which is not in the list and not closed. */
+void sender_on_link(struct sender *sender, struct link *link);
 
 /* Send through another socket from now on. The caller closes the earlier one when no thread uses it. */
 void sender_move(struct sender *sender, int fd, int listener);

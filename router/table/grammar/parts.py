@@ -8,6 +8,7 @@ from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
 from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
+from router.table.model.serial import SerialLine
 from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
@@ -177,8 +178,31 @@ _DEFAULTS = key("Defaults", "Values for parts of the table that do not set their
     ))),
 }))  # fmt: skip
 
+_LISTENER = {
+    "if": {"type": "object", "required": ["serial"]},
+    "then": part(
+        SerialLine,
+        framing=key(
+            "Framing",
+            "How frames are told apart in the bytes. cobs, slip and hdlc have delimiters, so the next frame can be "
+            "read after a bad one; hdlc frames are those of Pigweed, with its CRC-32. varint and {length: ...}: the "
+            "length comes first.",
+            ref("stream_framing"),
+            "cobs", "slip", "hdlc", "varint", {"length": "u16le"},
+        ),
+        checksum=key(
+            "Checksum",
+            "The checksum behind each payload, inside the frame, its low byte first; {crc16_xmodem: be}: its high byte "
+            "first. Default: none.",
+            ref("checksum"),
+            "crc16_ccitt_false", {"crc16_xmodem": "be"},
+        ),
+    ),
+    "else": part(Listener),
+}  # fmt: skip
+
 PARTS: Schema = {
-    "listener": part(Listener),
+    "listener": _LISTENER,
     "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,
     "case": _CASE,

@@ -71,11 +71,17 @@ COMPLETE: Schema = {
             "http": {"required": ["address"]},
             "record": {"required": required(RecordSettings)},
             "foxglove": {"required": ["address"]},
-            "listen": _each({"required": required(Listener)}),
+            "listen": _each(
+                {
+                    "if": {"required": ["serial"]},
+                    "then": {"required": ["baud", "framing"]},
+                    "else": {"required": required(Listener)},
+                }
+            ),
             "endpoints": _each(
                 {
                     "required": required(Endpoint),
-                    "if": {"anyOf": [{"required": ["group"]}, {"required": ["broadcast"]}]},
+                    "if": {"anyOf": [{"required": ["group"]}, {"required": ["broadcast"]}, {"required": ["listener"]}]},
                     "else": {"required": ["address"]},
                 }
             ),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from router.table.grammar.keys import BOOLEAN, REASON, TEXT, Schema, about, key, mapping, ref
 from router.table.model.expressions import FieldMap
+from router.table.model.serial import LENGTHS, ChecksumKind
 from router.table.units import BYTES, DISK_BYTES, NANOSECONDS
 
 _VARIABLE = r"\$\{"
@@ -23,6 +24,7 @@ _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _POSITIVE = rf"(?=[0-9.]*[1-9]){_NUMBER}"
 _TIME = f"{_POSITIVE} ?(?:{'|'.join(NANOSECONDS)})"
 _NAME = "[A-Za-z_][A-Za-z0-9_]*"
+_CHECKSUMS = [kind.value for kind in ChecksumKind]
 _KEY_PART = r"(?!@)[^/*$#?\s]+"
 _SCALAR = ["string", "number", "boolean"]
 _FIELDS: Schema = {"propertyNames": ref("field_path"), "additionalProperties": ref("field_value")}
@@ -71,6 +73,31 @@ VALUES: Schema = {
         rf"^(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}$",
         "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8'",
     ),
+    "device": _text(r"^/\S+$", "be the path of a device, such as '/dev/serial/by-id/usb-board-if00'"),
+    "stream_framing": {
+        "description": "A framing that is not only a name.",
+        "type": ["string", "object"],
+        "errorMessage": "must be cobs, slip, hdlc, varint, or a mapping such as {length: u16le}",
+        **one_of("string", {"enum": ["cobs", "slip", "hdlc", "varint"]}, mapping({
+            "length": key(
+                "Length", "The length of each frame, as an unsigned number before it.",
+                {"type": "string", "enum": [*LENGTHS]}, "u16le",
+            ),
+            "hdlc": key(
+                "HDLC address", "The address of the frames; frames with another one are bad frames.",
+                {"type": "integer", "minimum": 0, "maximum": 127}, 1,
+            ),
+        }, minProperties=1, maxProperties=1)),
+    },
+    "checksum": {
+        "description": "A checksum whose high byte comes first.",
+        "type": ["string", "object"],
+        "errorMessage": f"must be one of {', '.join(_CHECKSUMS)}, or a mapping such as {{crc32: be}}",
+        **one_of("string", {"enum": _CHECKSUMS}, mapping(
+            {name: key(name, "Its high byte comes first.", {"const": "be"}) for name in _CHECKSUMS},
+            minProperties=1, maxProperties=1,
+        )),
+    },
     "network": _text(f"^{_HOST}/(?:3[0-2]|[12]?[0-9])$", "be an IPv4 network, such as '127.0.0.0/8'"),
     "group": _text(
         f"^{_GROUP}$", "be a multicast group, from 224.0.0.0 to 239.255.255.255, such as '224.5.23.2'"

@@ -60,3 +60,13 @@ class RouteTable:
     networks: Networks | None = None
     states: Mapping[str, State] = field(default_factory=dict)
     package: Located[str] | None = None
+
+    @property
+    def sockets(self) -> tuple[Listener, ...]:
+        """The listeners that are UDP sockets."""
+        return tuple(listener for listener in self.listeners.values() if listener.line is None)
+
+    @property
+    def lines(self) -> tuple[Listener, ...]:
+        """The listeners that are serial lines."""
+        return tuple(listener for listener in self.listeners.values() if listener.line is not None)

@@ -1,4 +1,4 @@
-"""UDP addresses: the listeners of the router, and the endpoints that it knows."""
+"""Where messages arrive: the listeners of the router; and whom they come from and go to: the endpoints."""
 
 import enum
 from dataclasses import dataclass, field
@@ -8,6 +8,7 @@ from router.errors import Located, SourceSpan
 from router.table.addresses import BROADCAST, ENDPOINT, GROUP, LOCAL, Address
 from router.table.keys import Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
+from router.table.model.serial import SerialLine
 from router.table.units import DATA_RATE, PATIENCE, SIZE
 
 
@@ -31,7 +32,8 @@ class EndpointKind(enum.Enum):
 class Listener:
     """A local UDP address that the router binds.
 
-    `span` is its name in the table. `receive_buffer` is in bytes.
+    `span` is its name in the table. `receive_buffer` is in bytes. Of a serial line, the table sets only `line`, and its
+    address is a SerialPlace.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Listener:
 
     Example: [224.5.23.2]
     """
+    line: SerialLine | None = None
 
     @property
     def bound_to(self) -> str:
@@ -82,17 +85,18 @@ EPHEMERAL = "ephemeral"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A named UDP address: a board, a basestation, a tool.
+    """A named UDP address, or the other end of a serial line: a board, a basestation, a tool.
 
-    `span` is its name in the table. It has one of `unicast`, `group` and `broadcast`. `bandwidth` is in bytes per
-    second, `stale_after` in ns, None for never. `send_from` is a listener's name, EPHEMERAL, or None if it is not set.
+    `span` is its name in the table. It has one of `unicast`, `group` and `broadcast`; the other end of a serial line
+    has a SerialPlace as `unicast`. `bandwidth` is in bytes per second, `stale_after` in ns, None for never. `send_from`
+    is a listener's name, EPHEMERAL, or None if it is not set.
     """
 
     name: str
     span: SourceSpan
     unicast: Annotated[Located[Address] | None, ENDPOINT, Named("address")] = None
     """Where datagrams to it are sent. Datagrams from it are recognised by the IP address. The running router resolves
-    a host name, again and again.
+    a host name, again and again. The other end of a serial line has none.
 
     Title: Endpoint address
     Example: 192.168.0.30:8
@@ -128,8 +132,8 @@ class Endpoint:
     Example: board
     """
     listener: Located[str] | None = None
-    """Accept its datagrams only at this listener; at any other, a datagram from its address counts as a stranger's.
-    Default: accept them at every listener.
+    """Accept its datagrams only at this listener; at any other, a datagram from its address counts as a stranger's. Or
+    the serial line that it is at the other end of. Default: accept them at every listener.
 
     Example: radio
     """
