@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
@@ -19,6 +20,8 @@ from router.observe.states import StateReading
 from router.observe.watch import Health
 from tests.acceptance.site import wait_until
 from tests.observe.counting import Counting
+from tests.small_tables import HEAD
+from tests.small_tables import program as small_program
 
 STALLED = Kind.PUBLISH_STALLED.metric
 SENT = "it was sent manual_brake {brake: true}"
@@ -581,6 +584,19 @@ def test_what_explains_other_problems_comes_first(router: Counting) -> None:
     router.count("messages_dropped", "imu_info", "basestation", "stale", to=3)
     kinds = [problem.kind for problem in router.look(6).problems if problem.kind is not Kind.ENDPOINT_NEVER_HEARD]
     assert kinds == [Kind.DEADMAN_CANNOT_SEND, Kind.DEADMAN_ACTIVE, Kind.ENDPOINT_SILENT, Kind.MESSAGES_DROPPED]
+
+
+def test_a_serial_line_that_is_closed_is_a_problem(tmp_path: Path) -> None:
+    line = "  uart: {serial: /dev/ttyAMA0, baud: 9600, framing: cobs}\n"
+    head = HEAD.replace("endpoints:\n", f"{line}endpoints:\n  lander: {{listener: uart, kind: board}}\n")
+    router = Counting(small_program(tmp_path, "  ph_info: {source: lander, destinations: [basestation]}\n", head))
+    [closed] = router.look(2).problems
+    assert closed.text == "the serial line uart is closed: nothing is received or sent"
+    assert "`fuser -v /dev/ttyAMA0`" in closed.remedy
+    router.count("link_up", "uart", to=1)
+    [silent] = router.look(10).problems
+    assert silent.text == "lander has not been heard since the router started"
+    assert "the wires of /dev/ttyAMA0" in silent.remedy
 
 
 @pytest.mark.parametrize("kind", Kind, ids=lambda kind: kind.alert)

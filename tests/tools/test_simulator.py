@@ -146,6 +146,15 @@ def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> N
         assert [change.state for change in changes] == [State.OBEYING, State.STOPPED]
 
 
+def test_serial_lines_are_not_simulated(wire: Wire, table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    text = path.read_text().replace("endpoints:\n", "endpoints:\n  lander: {listener: uart, kind: board}\n", 1)
+    line = "  uart: {serial: /dev/ttyAMA0, baud: 9600, framing: cobs}\n"
+    path.write_text(text.replace("listen:\n", f"listen:\n{line}", 1))
+    with pytest.raises(UsageError, match=r"table.yaml has serial lines, which are not simulated"):
+        Simulator(wire, read_table(path), seed=1)
+
+
 def test_names_of_nobody_are_told(wire: Wire, table_path: Callable[..., Path]) -> None:
     with pytest.raises(
         UsageError, match=r"no endpoint or payload case that is sent is called 'statoin'; did you mean 'station'\?"

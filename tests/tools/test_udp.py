@@ -12,6 +12,7 @@ from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools import udp
 from router.tools.udp import Sent, open_udp, send
+from tests.tables import ROUTES
 
 
 def test_addresses_as_typed(table: RouteTable) -> None:
@@ -29,6 +30,24 @@ def test_names_of_the_table(table: RouteTable) -> None:
     assert udp.listening("rover", table) == rover
     assert udp.destination("board", table) == board
     assert udp.origin("board", table) == Address(board.host, 0)
+
+
+def test_what_is_at_a_serial_line_has_no_address(tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    line = "{serial: /dev/ttyAMA0, baud: 9600, framing: cobs}"
+    path.write_text(f"extends: {ROUTES}/rover.yaml\nlisten: {{uart: {line}}}\n"
+                    "endpoints: {lander: {listener: uart, kind: board}}\n")  # fmt: skip
+    table = read_table(path)
+    for parse, name in (
+        (udp.destination, "lander"),
+        (udp.destination, "uart"),
+        (udp.listening, "lander"),
+        (udp.origin, "lander"),
+    ):
+        with pytest.raises(
+            UsageError, match=f"'{name}' is at the serial line /dev/ttyAMA0, but this works over UDP only"
+        ):
+            parse(name, table)
 
 
 def test_an_endpoint_known_by_its_source_port_sends_from_it(table_path: Callable[..., Path]) -> None:
