@@ -140,7 +140,7 @@ class EventReader:
         event, begin = DatagramEvent.from_buffer(record), ctypes.sizeof(DatagramEvent)
         place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
         host = inet_ntoa(event.address.to_bytes(4, "big"))
-        sender = f"from {host}:{event.port}"
+        sender = f"from {host}:{event.port}" if event.port else "from the serial line"
         if event.kind == EventKind.SUPERSEDED:
             detail = f"{sender}: {self._superseded(place, data)}"
             return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))

@@ -22,7 +22,8 @@ class Senders:
 
     def __init__(self, program: CompiledTable, mismatches: AbstractSet[Mismatch]) -> None:
         self._program = program
-        self._mismatches = sorted(mismatches)
+        lines = {line.name: line.address.value.host for line in program.table.lines}  # the router sees no host there
+        self._mismatches = sorted(each._replace(host=lines.get(each.listener, each.host)) for each in mismatches)
 
     @cached_property
     def sources(self) -> Mapping[str, set[str]]:

@@ -19,6 +19,7 @@ from router.compiler import check_table
 from router.compiler.compiled_table import CompiledTable
 from router.image.image import Image
 from router.image.writer import write_image
+from router.observe.senders import Senders
 from router.observe.snapshot import snapshot
 from router.startup_image.head_start import HeadStart
 from tests.acceptance.site import wait_until
@@ -213,6 +214,14 @@ def test_a_board_that_does_not_read_loses_its_own_commands_only_and_is_braked_fi
         assert frames.count(DRIVE) == sent
         site.drive()
         wait_until(lambda: DRIVE in site.board.frames()[len(frames) :])
+
+
+def test_a_payload_that_only_others_may_send_is_told_by_the_name_of_the_board(site: Site) -> None:
+    with capture_logs() as log, Router(site.program()) as router:
+        site.board.await_frames(1)
+        site.board.send(DRIVE)
+        wait_until(lambda: any("from the serial line" in each.get("detail", "") for each in log))
+        assert Senders(router.program, router.mismatches().keys()).of("manual_drive") == [f"board ({site.board.path})"]
 
 
 def test_a_frame_is_as_old_as_its_first_byte(site: Site) -> None:
