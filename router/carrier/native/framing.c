@@ -29,7 +29,8 @@ size_t checksum_size(uint32_t kind) { return CRCS[kind].size; }
 /* Bit by bit: at the speed of a serial line, tables would save nothing that can be measured. */
 uint32_t checksum_of(uint32_t kind, const uint8_t *bytes, size_t length) {
     const struct crc *crc = &CRCS[kind];
-    uint32_t value = crc->start, bits = 8 * crc->size, top = bits ? 1U << (bits - 1) : 0;
+    if (!crc->size) return 0;
+    uint32_t value = crc->start, bits = 8 * crc->size, top = 1U << (bits - 1);
     for (size_t index = 0; index < length; index++) {
         value ^= crc->is_reversed ? bytes[index] : (uint32_t)bytes[index] << (bits - 8);
         for (int bit = 0; bit < 8; bit++) {
