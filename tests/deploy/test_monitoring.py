@@ -35,6 +35,9 @@ gateways:
     inbound: [{{topic: cmd_vel, type: geometry_msgs/msg/Twist}}]
 record: {{directory: recordings, continuous: true}}
 foxglove: {{address: 127.0.0.1:@foxglove}}
+state:
+  mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL}}
+  driver: {{topic: driver, type: std_msgs/msg/String, value: data, initial: "'nobody'"}}
 """
 )
 """The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
@@ -42,9 +45,9 @@ foxglove: {{address: 127.0.0.1:@foxglove}}
 MADE_BY_PROMETHEUS = {"up"}
 OF_OTHER_TABLES = {
     "router_messages_collected_total", "router_gateway_connections", "router_deadman_disobeyed",
-    "router_groups_not_joined", "router_endpoint_unresolved",
+    "router_groups_not_joined", "router_endpoint_unresolved", "router_messages_split_total",
 }  # fmt: skip
-"""The rover has no route that collects, Zenoh gateway, deadman with `obeyed`, multicast group or host name."""
+"""The rover has no route that collects, `for_each`, Zenoh gateway, deadman with `obeyed`, multicast group or host name."""
 OF_OTHERS = {"router_type_incompatible", "router_other_routers"}
 """Nobody else is in the ROS domain."""
 OF_SILENT_ENDPOINTS = {"instance_endpoint_target_reason:router_messages_dropped:rate1m"}

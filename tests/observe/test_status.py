@@ -70,13 +70,14 @@ def test_what_is_counted_is_found_by_route_and_target_and_endpoint(running: Fake
     running.count("datagrams_sent", "imu_info", "basestation", to=7)
     running.count("messages_dropped", "imu_info", "basestation", "send_error", to=2)
     running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    running.count("messages_split", "imu_info", "imu_data", to=4)
     running.count("route_silence_seconds", "imu_info", to=boottime_ns() - 3 * 10**9)
     running.count("endpoint_silence_seconds", "sensor_board", to=boottime_ns() - 2 * 10**9)
     found = shown.numbers()
     route = found["routes"]["imu_info"]
     assert route["sources"] == {"sensor_board": 9}
     assert route["targets"]["basestation"] == {"delivered": 7, "dropped": {"send_error": 2}}
-    assert route["targets"]["imu_data"] == {"delivered": 0, "dropped": {}, "filtered": 9}
+    assert route["targets"]["imu_data"] == {"delivered": 0, "dropped": {}, "filtered": 9, "split": 4}
     assert (route["silence"], route["buckets"][-1]) == (pytest.approx(3, abs=1), ["+Inf", 0])
     assert found["endpoints"]["sensor_board"] == {"silence": pytest.approx(2, abs=1), "stale_after": 5}
 
