@@ -47,7 +47,8 @@ OF_OTHER_TABLES = {
     "router_messages_collected_total", "router_gateway_connections", "router_deadman_disobeyed",
     "router_groups_not_joined", "router_endpoint_unresolved", "router_messages_split_total",
 }  # fmt: skip
-"""The rover has no route that collects, `for_each`, Zenoh gateway, deadman with `obeyed`, multicast group or host name."""
+"""The rover has no route that collects, `for_each`, Zenoh gateway, deadman with `obeyed`, multicast group or host
+name."""
 OF_OTHERS = {"router_type_incompatible", "router_other_routers"}
 """Nobody else is in the ROS domain."""
 OF_SILENT_ENDPOINTS = {"instance_endpoint_target_reason:router_messages_dropped:rate1m"}
