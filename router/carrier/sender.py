@@ -14,8 +14,8 @@ class NativeSender:
 
     `address` is that of its `struct sender`. `leaves_from` is the address that the socket is bound to, 0.0.0.0 if the
     kernel chooses one for each datagram; `is_bound`: it sends from the port of its listener. `cast` is as in
-    `compiler.network`: until the network interface of a group is there, sending fails with EBADF, and so it does to a
-    host name.
+    `compiler.network`: until the network interface of a group is there, sending fails with EBADF. To a host name, and
+    until an address is learned, it fails with EDESTADDRREQ.
     """
 
     def __init__(
@@ -31,8 +31,7 @@ class NativeSender:
         self._cast = cast
         self._place(source, opened)
         host, port = destination
-        self._is_named = not host.replace(".", "").isdigit()
-        number = 0 if self._is_named else int.from_bytes(socket.inet_aton(host), "big")
+        number = int.from_bytes(socket.inet_aton(host), "big") if host.replace(".", "").isdigit() else 0
         self.address = int(library.sender_open(self._aimed(), self._listening, number, port) or 0)
         if not self.address:
             opened.close()
@@ -56,8 +55,6 @@ class NativeSender:
 
     def _aimed(self) -> int:
         """Prepare the socket for its cast, and return its descriptor, or -1 while sending must fail."""
-        if self._is_named:
-            return -1
         if isinstance(self._cast, tuple):
             from router.net.multicast import aim  # few tables need it
 

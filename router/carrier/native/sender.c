@@ -16,11 +16,30 @@ enum { MOST_ERRORS = 32 }; /* read at once */
 static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held only briefly */
 static struct sender *first;
 
+_Static_assert(offsetof(struct sockaddr_in, sin_zero) == sizeof(uint64_t), "an address with its port is one word");
+
+static uint64_t packed(const struct sockaddr_in *address) {
+    uint64_t word;
+    memcpy(&word, address, sizeof word);
+    return word;
+}
+
+static struct sockaddr_in unpacked(uint64_t word) {
+    struct sockaddr_in address = {0};
+    memcpy(&address, &word, sizeof word);
+    return address;
+}
+
+void sender_aim(struct sender *sender, uint32_t address, uint16_t port) {
+    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(address)};
+    uint64_t word = address ? packed(&to) : 0;
+    if (atomic_exchange(&sender->to, word) != word) sender_take_refused(sender);
+}
+
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port) {
     struct sender *sender = calloc(1, sizeof *sender);
     if (!sender) return NULL;
-    sender->address = (struct sockaddr_in){
-        .sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(address)};
+    sender_aim(sender, address, port);
     sender_move(sender, fd, listener);
     pthread_mutex_lock(&list_lock);
     sender->next = first;
@@ -94,11 +113,10 @@ static bool note(struct sender *sender, int refused) {
 
 /* Record an error for the first sender to the address that has none yet. */
 static void note_by_address(const struct sockaddr_in *address, int refused) {
+    uint64_t to = packed(address);
     pthread_mutex_lock(&list_lock);
     for (struct sender *each = first; each; each = each->next)
-        if (each->address.sin_port == address->sin_port && each->address.sin_addr.s_addr == address->sin_addr.s_addr &&
-            note(each, refused))
-            break;
+        if (atomic_load_explicit(&each->to, memory_order_relaxed) == to && note(each, refused)) break;
     pthread_mutex_unlock(&list_lock);
 }
 
@@ -131,8 +149,9 @@ int sender_take_refused(struct sender *sender) {
 /* Send a datagram. Return 0 or an errno. */
 static int send_once(struct sender *sender, const void *data, size_t size) {
     int fd = atomic_load_explicit(&sender->fd, memory_order_relaxed);
-    const struct sockaddr *to = (const struct sockaddr *)&sender->address;
-    return sendto(fd, data, size, MSG_DONTWAIT, to, sizeof sender->address) < 0 ? errno : 0;
+    struct sockaddr_in to = unpacked(atomic_load_explicit(&sender->to, memory_order_relaxed));
+    if (!to.sin_family) return EDESTADDRREQ;
+    return sendto(fd, data, size, MSG_DONTWAIT, (const struct sockaddr *)&to, sizeof to) < 0 ? errno : 0;
 }
 
 /* Send from the port of the socket, and from an address that the kernel chooses. Return 0 or an errno. */
@@ -142,7 +161,8 @@ static int send_from_any_address(struct sender *sender, const void *data, size_t
     control.aligned = (struct cmsghdr){.cmsg_len = CMSG_LEN(sizeof(struct in_pktinfo)), .cmsg_level = IPPROTO_IP,
                                        .cmsg_type = IP_PKTINFO};
     struct iovec from = {(void *)(uintptr_t)data, size};
-    struct msghdr message = {.msg_name = &sender->address, .msg_namelen = sizeof sender->address, .msg_iov = &from,
+    struct sockaddr_in to = unpacked(atomic_load(&sender->to));
+    struct msghdr message = {.msg_name = &to, .msg_namelen = sizeof to, .msg_iov = &from,
                              .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof control};
     return sendmsg(atomic_load(&sender->fd), &message, MSG_DONTWAIT) < 0 ? errno : 0;
 }

@@ -16,21 +16,28 @@ struct link;
 
 struct sender {
     struct sender *next; /* in the list of all senders */
-    struct link *link;   /* NULL for a socket. A link has no socket, so sending through that fails first */
-    struct sockaddr_in address;
+    struct link *link;   /* NULL for a socket. A link has no address, so sending to that fails first */
+    _Atomic uint64_t to;  /* the bytes of its struct sockaddr_in without the padding; 0 while it has no address */
     _Atomic int fd;       /* -1 after `sender_end` */
     _Atomic int listener; /* the socket of the listener from whose port it sends; -1 for none */
     _Atomic int refused;  /* errno about an earlier datagram, not returned yet; 0 for none */
 };
 
-/* Open a sender to `address` (host byte order) and `port`. Returns NULL if memory runs out. The caller closes the sockets
- * after `sender_end`, after which sending fails with EBADF. */
+/* Open a sender to `address` (host byte order) and `port`; to 0 and 0 while it has no address, and sending fails with
+ * EDESTADDRREQ. Returns NULL if memory runs out. The caller closes the sockets after `sender_end`, after which sending fails
+ * with EBADF. */
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);
 void sender_end(struct sender *sender);
 void sender_close(struct sender *sender); /* when nothing uses it */
 
 /* Make the sender of a link, which is not in the list and not closed. */
 void sender_on_link(struct sender *sender, struct link *link);
+
+/* Send to another address from now on, or to none. Errors about the earlier one are forgotten. */
+void sender_aim(struct sender *sender, uint32_t address, uint16_t port);
+static inline bool sender_has_address(const struct sender *sender) {
+    return atomic_load_explicit(&sender->to, memory_order_relaxed) != 0;
+}
 
 /* Send through another socket from now on. The caller closes the earlier one when no thread uses it. */
 void sender_move(struct sender *sender, int fd, int listener);
