@@ -131,6 +131,7 @@ class Plane:
             reporter.report,
             of_deadmen,
             reporter.returned,
+            reporter.learned,
             reporter.link_changed,
             self._state_changed,
             self._pulse,

@@ -130,7 +130,7 @@ class Sockets:
                 beside = source.opened if source is not None else None
                 wanted, (known, sender) = destination(program.table, to), self._senders.get(to.name, (None, None))
                 is_new = sender is None or known != wanted
-                if not to.address.value.is_name:
+                if to.address.value.is_known:
                     _check_reachable(to, is_new)
                 if sender is None or is_new:
                     opened = open_sending(to, source, every)
@@ -141,7 +141,7 @@ class Sockets:
                     opened = open_sending(to, source, every)
                     opening.callback(opened.close)
                     moves.append((sender, beside, opened))
-                if not to.address.value.is_name:
+                if to.address.value.is_known:
                     _check_source(to, sender)
                 senders[to.name] = sender
             used = [each.opened for each in listeners.values()]

@@ -11,7 +11,7 @@ from socket import inet_ntoa
 from typing import Union, cast
 
 from router.carrier.threads import NativeThread
-from router.compiler.metrics import Answer, Evidence, Mismatch, Report
+from router.compiler.metrics import Answer, Evidence, Mismatch, Report, origin_text
 from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS, why_refused
 from router.declared import (
     NO_NAME,
@@ -20,6 +20,7 @@ from router.declared import (
     DeadmanEvent,
     EventHead,
     EventKind,
+    LearnedEvent,
     LinkEvent,
     LostEvent,
     Reason,
@@ -48,6 +49,18 @@ class Returned:
 
     endpoint: str
     silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """The address of an endpoint was learned. `before` is the earlier one, "" if there was none.
+
+    `after` is "" if a reload has excluded the earlier one.
+    """
+
+    endpoint: str
+    before: str
+    after: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +114,7 @@ class EventReader:
 
     def read(
         self, kind: int, record: memoryview
-    ) -> DeadmanEvents | StateChange | Returned | LinkChange | CountedReport:
+    ) -> DeadmanEvents | StateChange | Learned | Returned | LinkChange | CountedReport:
         if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
             return self._of_datagram(record)
         if kind == EventKind.LOST:
@@ -111,6 +124,10 @@ class EventReader:
         if kind == EventKind.RETURNED:
             returned = ReturnedEvent.from_buffer(record)
             return Returned(self._name(returned.endpoint), returned.silence / 1e9)
+        if kind == EventKind.LEARNED:
+            learned = LearnedEvent.from_buffer(record)
+            before, after = (origin_text(at) if at else "" for at in (learned.before, learned.after))
+            return Learned(self._name(learned.endpoint), before, after)
         if kind == EventKind.STATE:
             changed = StateEvent.from_buffer(record)
             source = self._name(changed.source) if changed.source != NO_NAME else None
@@ -168,9 +185,9 @@ class EventThread:
     """Reads the events of native threads, and calls `pulse` every few seconds to signal that Python is alive.
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
-    that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s),
-    `link_changed` a link and why it is closed (errno; 0: it is open), `state_changed` a state that has changed,
-    `of_deadmen` everything else.
+    that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s), `learned` one
+    whose address was learned, with the address before and now, `link_changed` a link and why it is closed (errno; 0: it
+    is open), `state_changed` a state that has changed, `of_deadmen` everything else.
     """
 
     def __init__(
@@ -180,6 +197,7 @@ class EventThread:
         report: Callable[[Report], None],
         of_deadmen: Callable[[DeadmanEvents], None],
         returned: Callable[[str, float], None],
+        learned: Callable[[str, str, str], None],
         link_changed: Callable[[str, int], None],
         state_changed: Callable[[StateChange], None],
         pulse: Callable[[], None],
@@ -189,6 +207,7 @@ class EventThread:
         self._report = report
         self._of_deadmen = of_deadmen
         self._returned = returned
+        self._learned = learned
         self._link_changed = link_changed
         self._state_changed = state_changed
         self._pulse = pulse
@@ -237,6 +256,8 @@ class EventThread:
         match self._reader.read(kind, record):
             case Returned(endpoint, silence):
                 self._returned(endpoint, silence)
+            case Learned(endpoint, before, after):
+                self._learned(endpoint, before, after)
             case StateChange() as change:
                 self._state_changed(change)
             case LinkChange(listener, error):

@@ -9,7 +9,15 @@ from typing import NamedTuple, Union
 from weakref import finalize
 
 from router import declared as c
-from router.carrier.events import CountedReport, DeadmanEvents, EventReader, LinkChange, Returned, StateChange
+from router.carrier.events import (
+    CountedReport,
+    DeadmanEvents,
+    EventReader,
+    Learned,
+    LinkChange,
+    Returned,
+    StateChange,
+)
 from router.carrier.loading import LoadedImage
 from router.carrier.reasons import superseded, where_refused, why_rejected
 from router.compiler.compiled_table import CompiledTable
@@ -17,6 +25,7 @@ from router.declared import MOST_COUNTERS, RecordKind
 from router.image.image import Image
 from router.image.names import Names
 from router.image.writer import write_image
+from router.table.addresses import LEARNED
 
 Peer = tuple[str, int]
 
@@ -41,7 +50,7 @@ class Output(NamedTuple):
     data: bytes
 
 
-Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Returned, LinkChange, CountedReport]
+Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Learned, Returned, LinkChange, CountedReport]
 
 
 class Simulation:
@@ -185,7 +194,7 @@ class _Opened:
     def sender(self, endpoint: str, address: Peer) -> _Sender:
         """Return the sender of an endpoint; one that gets another address gets another sender."""
         if (endpoint, address) not in self._senders:
-            self._senders[endpoint, address] = _Sender(self.library)
+            self._senders[endpoint, address] = _Sender(self.library, has_address=address != LEARNED)
         return self._senders[endpoint, address]
 
     def reopen(self, now: int) -> None:
@@ -206,11 +215,12 @@ class _Opened:
 
 
 class _Sender:
-    """A sender without a socket."""
+    """A sender without a socket. It has no address until that is learned."""
 
-    def __init__(self, library: ctypes.CDLL) -> None:
+    def __init__(self, library: ctypes.CDLL, *, has_address: bool) -> None:
         self._library = library
-        self.address = int(library.sender_open(-1, -1, 0, 0) or 0)
+        number = int(has_address)  # nothing is sent there
+        self.address = int(library.sender_open(-1, -1, number, number) or 0)
         if not self.address:
             raise MemoryError("a sender of the simulation cannot be opened")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,8 @@ def add_parser(subparsers: Subparsers) -> None:
     examples = ("router status", "router status --json", _UNTIL_IT_RUNS)
     parser = add_verb(subparsers, "status", _DESCRIPTION, *examples)
     add_router_options(parser)
-    parser.add_argument("--json", action="store_true", help="a JSON object: state, url, problems, states, received")
+    has = "a JSON object: state, url, problems, states, learned, received"
+    parser.add_argument("--json", action="store_true", help=has)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,17 +43,20 @@ def run(args: argparse.Namespace) -> int:
     url = running_url(args)
     received = None
     states: Sequence[StateReading] = ()
+    learned: Mapping[str, str] = {}
     try:
-        *_, received, states, problems = answer = health(url)
+        *_, received, states, learned, problems = answer = health(url)
         state, code = ("degraded", DEGRADED) if answer.is_degraded else ("running", OK)
     except TransportError as error:
         state, code, problems = "down", NETWORK_FAULT, (down(url, error),)
     if args.json:
         listed = [problem.json() for problem in problems]
         shown = [asdict(each) for each in states]
-        print(json.dumps({"state": state, "url": url, "problems": listed, "states": shown, "received": received}))
+        known = {"state": state, "url": url, "problems": listed, "states": shown, "learned": learned}
+        print(json.dumps({**known, "received": received}))
     else:
         details = [*(problem.text for problem in problems), *(f"{each.name} is {each.value}" for each in states)]
+        details += [f"{name} is at {address}" for name, address in learned.items()]
         if received is not None:
             details.append(f"{plural(received, 'datagram')} received")
         print(wrapped(f"{state}: {'; '.join(details)}", sys.stdout))

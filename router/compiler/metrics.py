@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from router.declared import HISTOGRAM_BOUNDS, MOST_COUNTERS
@@ -17,9 +18,10 @@ from router.errors import ConfigurationError
 @dataclass(frozen=True, slots=True)
 class Metric:
     """One metric. `kind` is counter, histogram, number, level, time (nanoseconds in the counters, seconds exported), or
-    age: the boot clock (ns) at an event in the counters, the seconds since then exported, no series before it.
+    age: the boot clock (ns) at an event in the counters, the seconds since then exported, no series before it. Of the
+    kind origin, the counter has an address and a port, which are exported as the last label; no series before that.
 
-    One thread sets a number, a time or an age; several add to a level and subtract from it. A metric that
+    One thread sets a number, a time, an age or an origin; several add to a level and subtract from it. A metric that
     `tells_commands` is also exported with the label COMMAND, which follows from its `route` and `target`. `bounds` (ns)
     are a histogram's.
     """
@@ -126,6 +128,12 @@ METRICS = (
         "How long ago the endpoint was first heard since its last silence; no series until it has sent.",
     ),
     Metric("endpoint_unresolved", "number", ("endpoint",), "1 while its host name is not resolved."),
+    Metric(
+        "endpoint_learned",
+        "origin",
+        ("endpoint", "address"),
+        "1 for the address and port that were learned; no series before that.",
+    ),
     Metric("endpoint_silences", "counter", ("endpoint",), "How often the endpoint was heard again after a silence."),
     Metric("endpoint_last_silence_seconds", "time", ("endpoint",), "How long the last such silence was."),
     Metric(
@@ -457,8 +465,9 @@ class Counters:
 
     def _open(self, metric: str, labels: tuple[str, ...]) -> int:
         declared = _BY_NAME[metric]
-        if len(labels) != len(declared.labels):
-            raise ValueError(f"{metric} has the labels {declared.labels}, not {list(labels)}")
+        counted = declared.labels[:-1] if declared.kind == "origin" else declared.labels
+        if len(labels) != len(counted):
+            raise ValueError(f"{metric} has the labels {counted}, not {list(labels)}")
         length = _length_of(declared)
         if free := self._free.get(length):
             start = free.pop()
@@ -543,6 +552,11 @@ class Counters:
                 counts[run] = [0] * length
             del self._indexes[metric][labels]
             self._free.setdefault(length, []).append(run.start)
+
+
+def origin_text(origin: int) -> str:
+    """Return an address and port, as native code packs them, as text."""
+    return f"{IPv4Address(origin >> 16)}:{origin & 0xFFFF}"
 
 
 _COUNTED = ("counter", "histogram")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from itertools import combinations
+from ipaddress import IPv4Network
+from itertools import combinations, product
 from typing import TypeAlias
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
@@ -44,6 +45,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _group_findings(table)
     yield from _several_machines(table)
+    yield from _learned_findings(table)
     yield from _listener_findings(table)
     yield from _line_findings(table)
     for endpoint in table.endpoints.values():
@@ -135,6 +137,33 @@ def _several_machines(table: RouteTable) -> Iterator[Diagnostic]:
             yield Diagnostic(sources[endpoint.name], Code.BAD_VALUE, message, hint)
 
 
+def _learned_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for endpoints whose address is learned."""
+    sources = {source.value for route in table.routes for source in route.sources}
+    for endpoint in table.endpoints.values():
+        address = endpoint.address
+        if not address.value.is_learned:
+            continue
+        if endpoint.kind is EndpointKind.BOARD and endpoint.because is None:
+            message = f"'{endpoint.name}' is a board, but any computer may send first and get its commands and brakes"
+            hint = "write the board's address, or say with `because` why nothing else can send to the listener"
+            yield Diagnostic(address.span, Code.MISSING_KEY, message, hint)
+        if endpoint.name not in sources and not table.broken:
+            message = f"the address of '{endpoint.name}' is never learned: no route names it as its source"
+            hint = "write a route for what it sends, or its address"
+            yield Diagnostic(address.span, Code.BAD_VALUE, message, hint)
+        for network in endpoint.networks:
+            if table.networks and not any(network.subnet_of(each) for each in table.networks.members):
+                message = f"'networks' of endpoints.{endpoint.name} has {network}, outside {table.networks}"
+                hint = "remove it: without 'networks', the endpoint has those of the table"
+                yield Diagnostic(address.span, Code.OUTSIDE_NETWORKS, message, hint)
+
+
+def networks_of(table: RouteTable, endpoint: Endpoint) -> Sequence[IPv4Network]:
+    """Return the networks in which the address of an endpoint may be learned; none for any."""
+    return endpoint.networks or (table.networks.members if table.networks is not None else ())
+
+
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for unknown listeners of endpoints, and for listeners that accept no sending endpoint."""
     for endpoint in table.endpoints.values():
@@ -213,6 +242,8 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
         return None
     if one.listener and other.listener and one.listener.value != other.listener.value:
         return None
+    if one.address.value.is_learned:
+        return _learned_clash(one, other)
     host = one.address.value.host
     if one.source_port is None or other.source_port is None:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host}"
@@ -224,6 +255,17 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host} and the source port"
         return Diagnostic(other.source_port.span, Code.ADDRESS_CLASH, message, "give each its own source_port")
     return None
+
+
+def _learned_clash(one: Endpoint, other: Endpoint) -> Diagnostic | None:
+    """Return a finding if both endpoints could be learned from one sender."""
+    ports = [each.source_port.value for each in (one, other) if each.source_port is not None]
+    pairs = product(one.networks, other.networks)
+    if len({*ports}) > 1 or (one.networks and other.networks and not any(a.overlaps(b) for a, b in pairs)):
+        return None
+    message = f"a sender could be learned as '{one.name}' or as '{other.name}'"
+    hint = "give each its own 'source_port', 'networks' or 'listener'"
+    return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
 
 
 def loop_finding(
@@ -291,7 +333,7 @@ def recognisers(
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
-    Endpoints of other listeners are omitted, unless `listener` is None, and those whose host name is not resolved. An
+    Endpoints of other listeners are omitted, unless `listener` is None, and those whose address is not known. An
     IP address that several endpoints share without source ports identifies none of them; this is only valid if none is
     a source.
     """
@@ -300,7 +342,7 @@ def recognisers(
     for endpoint in endpoints.values():
         if listener is not None and endpoint.listener is not None and endpoint.listener.value != listener:
             continue
-        if endpoint.address.value.is_name:
+        if endpoint.address.value.is_name or endpoint.address.value.is_learned:
             continue
         host, _ = sent_by(endpoint)
         if endpoint.source_port is not None:

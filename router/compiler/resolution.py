@@ -1,12 +1,13 @@
-"""Host names of endpoints: a compiled table with the addresses that the running router has found for them."""
+"""Endpoints without a written address: host names, for which the running router finds addresses, and learned ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from ipaddress import IPv4Address
 
 from router.compiler.compiled_table import CompiledTable
-from router.compiler.network import reaches
+from router.compiler.network import networks_of, reaches
 from router.table.addresses import Address, BadAddressError, parse_remote
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint
@@ -19,7 +20,7 @@ def names(program: CompiledTable) -> dict[str, str]:
 
 
 def unresolved(table: RouteTable) -> list[str]:
-    """Return the endpoints that have no address: nothing is sent to them, and nothing from them is recognised."""
+    """Return the endpoints with a host name: nothing is sent to them, and nothing from them is recognised."""
     return [each.name for each in table.endpoints.values() if each.address.value.is_name]
 
 
@@ -36,6 +37,14 @@ def _at(endpoint: Endpoint, hosts: Mapping[str, str]) -> Endpoint:
     if address is None or address.value.host not in hosts:
         return endpoint
     return replace(endpoint, unicast=replace(address, value=Address(hosts[address.value.host], address.value.port)))
+
+
+def stand_in(table: RouteTable, endpoint: Endpoint, default: str) -> str:
+    """Return a host from which the address of a learned endpoint may be learned: `default`, or else one that fits."""
+    networks = networks_of(table, endpoint)
+    if not networks or any(IPv4Address(default) in network for network in networks):
+        return default
+    return str(next(networks[0].hosts()))
 
 
 def with_stand_ins(program: CompiledTable) -> CompiledTable:

@@ -83,6 +83,8 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
     for metric in ENDPOINT_METRICS:
         _open_each(counters, metric, last=table.endpoints)
     _open_each(counters, "endpoint_unresolved", last=unresolved(table))
+    learned = (each.name for each in table.endpoints.values() if each.address.value.is_learned)
+    _open_each(counters, "endpoint_learned", last=learned)
 
 
 def _open_own(counters: Counters, table: RouteTable) -> None:

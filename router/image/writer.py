@@ -14,7 +14,7 @@ from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan,
 from router.compiler.lowering import LoweredFeed
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
-from router.compiler.network import destination, recognisers, sent_from
+from router.compiler.network import destination, networks_of, recognisers, sent_from
 from router.compiler.refusals import REJECTIONS
 from router.declared import NONE
 from router.image.boards import write_boards
@@ -154,7 +154,7 @@ class _Writer:
     def _listener(self, plan: Listener, protocol: ctypes._Pointer[c.Protocol]) -> c.Listener:
         """Write a listener, without its socket."""
         counters, name = self.counters, plan.name
-        peers = list(self._peers(name))
+        peers, learned = list(self._peers(name)), list(self._learned(name))
         return c.Listener(
             fd=-1,
             id=self.targets.openings.names.number(name),
@@ -162,8 +162,10 @@ class _Writer:
             link=self.targets.openings.link(plan) if plan.line is not None else None,
             protocol=protocol,
             peers=self.arrays.array(c.Peer, peers),
+            learned=self.arrays.array(c.LearnedPeer, learned),
             choices=self.arrays.array(c.Choice, list(self._choices())),
             peer_count=len(peers),
+            learned_count=len(learned),
             columns=len(self.columns) + 1,
             received=counters.index("datagrams_received", name),
             received_bytes=counters.index("received_bytes", name),
@@ -178,19 +180,45 @@ class _Writer:
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
         for address, _, port, name in sorted((_number(host), not port, port, name) for host, port, name in known):
-            last_seen, heard_since, silences, last_silence = (
-                self.counters.index(metric, name) for metric in ENDPOINT_METRICS
-            )
-            yield c.Peer(
-                address=address,
-                port=port,
-                column=self.columns[name],
-                last_seen=last_seen,
-                heard_since=heard_since,
-                silences=silences,
-                last_silence=last_silence,
-                id=self.targets.openings.names.number(name),
-                pause=_pause(self.program.table.endpoints[name]),
+            peer = self._peer(name)
+            peer.address, peer.port = address, port
+            yield peer
+
+    def _peer(self, name: str) -> c.Peer:
+        """Write an endpoint as a sender, without its address."""
+        last_seen, heard_since, silences, last_silence = (
+            self.counters.index(metric, name) for metric in ENDPOINT_METRICS
+        )
+        return c.Peer(
+            column=self.columns[name],
+            last_seen=last_seen,
+            heard_since=heard_since,
+            silences=silences,
+            last_silence=last_silence,
+            id=self.targets.openings.names.number(name),
+            pause=_pause(self.program.table.endpoints[name]),
+        )
+
+    def _learned(self, listener: str) -> Iterator[c.LearnedPeer]:
+        """Yield the endpoints whose address this listener learns."""
+        table = self.program.table
+        sent_to = {each.name for each in self.program.senders}
+        for endpoint in table.endpoints.values():
+            is_here = endpoint.listener is None or endpoint.listener.value == listener
+            if not endpoint.address.value.is_learned or not is_here:
+                continue
+            networks = [
+                c.Network(address=int(each.network_address), mask=int(each.netmask))
+                for each in networks_of(table, endpoint)
+            ]
+            yield c.LearnedPeer(
+                peer=self._peer(endpoint.name),
+                sender=self.targets.openings.sender(endpoint.name) if endpoint.name in sent_to else None,
+                networks=self.arrays.array(c.Network, networks),
+                network_count=len(networks),
+                port=endpoint.source_port.value if endpoint.source_port else 0,
+                origin=self.counters.index("endpoint_learned", endpoint.name),
+                stale_after=c.NEVER if endpoint.stale_after is None else endpoint.stale_after,
             )
 
     def _choices(self) -> Iterator[c.Choice]:

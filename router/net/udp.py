@@ -182,6 +182,8 @@ def nobody_listens(address: Address) -> str:
 
 def why_not_sent(error: OSError, address: Address) -> str:
     """Describe why nothing was sent to an address, with a command that shows more."""
+    if address.is_learned:
+        return "its address is not learned: nobody has sent a message for a route with this source"
     if address.is_name:
         return f"the host name {address.host} is not resolved: `getent ahostsv4 {address.host}`"
     ask = f"`ip route get {address.host}`"

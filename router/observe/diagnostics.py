@@ -147,9 +147,9 @@ class Report:
         )
 
     def _endpoint(self, endpoint: Endpoint) -> Status:
-        name, routes = endpoint.name, self._program.table.routes
+        name, routes, address = endpoint.name, self._program.table.routes, self._health.address_of(endpoint)
         values = [
-            ("address", endpoint.address.value),
+            ("address", address),
             ("kind", endpoint.kind.value),
             ("silent for", age_text(self._health.silence.get(name))),
             ("received", self._received[name]),
@@ -163,7 +163,7 @@ class Report:
         if any(name in away for away in self._health.away.values()):
             well = "is silent: nobody drives"
         problems = self._labelled(name, *_TO_ENDPOINTS)
-        return _status(f"endpoint/{name}", str(endpoint.address.value), problems, well, values)
+        return _status(f"endpoint/{name}", address, problems, well, values)
 
     def _route(self, route: Route) -> Status:
         name, health = route.name, self._health

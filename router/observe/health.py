@@ -35,7 +35,7 @@ from router.observe.senders import MOST_NAMED, Senders, few
 from router.observe.snapshot import SERIES, Labels, Snapshot
 from router.observe.states import StateReading, state_readings
 from router.table.addresses import SerialPlace
-from router.table.model.endpoints import EndpointKind
+from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.routes import ANY
 from router.values.printing import age_text
 
@@ -133,6 +133,13 @@ _OTHER_ADDRESS = (
     "If {sender} is {endpoint}, give it the address {address}, or correct `endpoints` and run `router reload`; "
     "`router tap --only rejected` shows what it sends."
 )
+_NOT_LEARNED = (
+    "It gets nothing before it sends: check that it runs, and sends to a listener of this computer that accepts it."
+)
+_NOT_LEARNED_FROM = (
+    "If {sender} is {endpoint}, its port, network or listener is another one than `endpoints` says, or it has to wait "
+    "until the earlier sender is silent for `stale_after`."
+)
 _FROM_TOPIC = "Have it send what a route accepts, or write a route for {payload_case} with this `source`."
 _WITHHELD = "They do not meet a condition (`when`) of the table: `router explain {route}` shows it."
 _SILENT_LINE = (
@@ -184,8 +191,18 @@ class HealthSnapshot:
         metrics = (Kind.ENDPOINT_NEVER_HEARD.metric, Kind.ENDPOINT_SILENT.metric)
         return {name: seconds for metric in metrics for (name,), seconds in self.now.counts(metric).items()}
 
+    def address_of(self, endpoint: Endpoint) -> str:
+        """Return the address of an endpoint as text; if it is learned, that one, or "not learned yet"."""
+        address = endpoint.address.value
+        return self.learned.get(endpoint.name, "not learned yet") if address.is_learned else str(address)
+
     def was_heard(self, endpoint: str) -> bool:
         return (endpoint,) in self.now.counts(Kind.ENDPOINT_SILENT.metric)
+
+    @cached_property
+    def learned(self) -> Mapping[str, str]:
+        """The learned addresses, by endpoint."""
+        return {labels[0]: labels[1] for labels in self.now.counts("endpoint_learned")}
 
     @cached_property
     def states(self) -> tuple[StateReading, ...]:
@@ -247,7 +264,7 @@ class HealthSnapshot:
 
     @cached_property
     def _senders(self) -> Senders:
-        return Senders(self.program, self.mismatches)
+        return Senders(self.program, self.mismatches, self.learned)
 
     @property
     def _sources(self) -> Mapping[str, set[str]]:
@@ -305,11 +322,15 @@ class HealthSnapshot:
     def _remedy_for_silence(self, endpoint: str) -> str:
         address = self._senders.host(endpoint)
         if (sender := self._senders.in_place_of(endpoint)) is not None:
+            if self._senders.is_learned(endpoint):
+                return _NOT_LEARNED_FROM.format(endpoint=endpoint, sender=sender)
             return _OTHER_ADDRESS.format(endpoint=endpoint, address=address, sender=sender)
         if len(self._stale) == len(self._limits) > 1:
             return _ALL_SILENT
         if isinstance(self.program.table.endpoints[endpoint].address.value, SerialPlace):
             return _SILENT_LINE.format(address=address)
+        if not address:
+            return _NOT_LEARNED.format(endpoint=endpoint)
         return Kind.ENDPOINT_SILENT.remedy.format(address=address)
 
     @property
@@ -502,6 +523,8 @@ class HealthSnapshot:
     def _remedy_for_loss(self, reason: str, route: str, target: str) -> str:
         if reason == "stale" and route in self._from_ros:
             return _STALE_FROM_ROS
+        if reason == "send_error" and target in self.program.table.endpoints and not self._senders.host(target):
+            return self._remedy_for_silence(target)
         return REMEDIES.get(reason, "").format(target=target)
 
     @cached_property
@@ -525,6 +548,7 @@ class HealthSnapshot:
         if "listener" in labels and labels["listener"] in table.listeners:
             address = table.listeners[labels["listener"]].bound_to
         elif (endpoint := table.endpoints.get(labels.get("endpoint") or labels.get("destination", ""))) is not None:
-            address = str(endpoint.address.value if "destination" in labels else endpoint.address.value.host)
+            host = self._senders.host(endpoint.name)
+            address = self.address_of(endpoint) if "destination" in labels and host else host or "its address"
         remedy = kind.remedy or REMEDIES.get(labels.get("reason") or labels.get("state", ""), "")
         return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)

@@ -18,7 +18,7 @@ from router.observe.snapshot import BUCKETS, PREFIX, Labels
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
-_EXPORTED_AS = {"time": "gauge", "age": "gauge", "number": "gauge", "level": "gauge"}
+_EXPORTED_AS = {"time": "gauge", "age": "gauge", "number": "gauge", "level": "gauge", "origin": "gauge"}
 
 
 class CountersCollector(Collector):

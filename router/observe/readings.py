@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
 
-from router.compiler.metrics import HISTOGRAM_CELLS, Counters, Metric
+from router.compiler.metrics import HISTOGRAM_CELLS, Counters, Metric, origin_text
 from router.compiler.metrics import metric as metric_named
 from router.observe.snapshot import BUCKETS, SERIES, Counts, Labels
 
@@ -101,6 +101,8 @@ class Reading(Mapping[str, Counts]):
         match metric_named(name).kind:
             case "age":
                 return {labels: max(now - at, 0) / 1e9 for labels, index in of(name) if (at := totals[index])}
+            case "origin":
+                return {(*labels, origin_text(at)): 1 for labels, index in of(name) if (at := totals[index])}
             case "time":
                 return {labels: totals[index] / 1e9 for labels, index in of(name)}
             case _:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,7 +13,7 @@ from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
 from router.net.serial import why_closed
 from router.net.udp import why_not_sent
-from router.table.addresses import Address
+from router.table.addresses import Address, parse_address
 from router.threads import Thread, join_or_abandon
 
 MOST_MISMATCHES = 64
@@ -38,6 +39,8 @@ class Reporter:
         self._lock = threading.Lock()
         self._lost: dict[tuple[str, str], tuple[int, Report]] = {}
         """The time and report of the last loss, by route and target."""
+        self._learned: dict[str, str] = {}
+        """The learned addresses, by endpoint."""
         self._unsent: dict[str, Report] = {}
         """By route whose deadman tripped because commands could not be sent: the last loss."""
         self._stopped = threading.Event()
@@ -91,6 +94,8 @@ class Reporter:
     def _text(self, error: BaseException, target: str) -> str:
         if not isinstance(error, OSError) or (address := self._address_of(target)) is None:
             return str(error)
+        if address.is_learned and error.errno != errno.EDESTADDRREQ and target in self._learned:
+            address = parse_address(self._learned[target])
         return why_not_sent(error, address)
 
     def failed(self, error: Exception) -> None:
@@ -122,6 +127,18 @@ class Reporter:
     def returned(self, endpoint: str, silence: float) -> None:
         """Log that an endpoint is heard again, after `silence` seconds: for example, a board was reset."""
         logger.warning(f"{endpoint} was silent for {silence:.1f} s and is back", endpoint=endpoint)
+
+    def learned(self, endpoint: str, before: str, after: str) -> None:
+        """Log that the address of an endpoint was learned, as in `carrier.events.Learned`."""
+        self._learned[endpoint] = after
+        if not after:
+            del self._learned[endpoint]
+            what = "the table excludes the address that was learned: nothing is sent to it until another one is learned"
+            logger.warning(what, endpoint=endpoint, before=before)
+        elif before:
+            logger.warning("another address was learned", endpoint=endpoint, address=after, before=before)
+        else:
+            logger.info("address learned", endpoint=endpoint, address=after)
 
     def link_changed(self, listener: str, error: int) -> None:
         """Log that a serial line was opened (`error` is 0), was closed, or cannot be opened (errno)."""

@@ -18,10 +18,13 @@ MOST_NAMED = 3
 
 
 class Senders:
-    """The senders of `mismatches`, judged by a program."""
+    """The senders of `mismatches`, judged by a program. `learned` are the learned addresses, by endpoint."""
 
-    def __init__(self, program: CompiledTable, mismatches: AbstractSet[Mismatch]) -> None:
+    def __init__(
+        self, program: CompiledTable, mismatches: AbstractSet[Mismatch], learned: Mapping[str, str]
+    ) -> None:
         self._program = program
+        self._learned = learned
         lines = {line.name: line.address.value.host for line in program.table.lines}  # the router sees no host there
         self._mismatches = sorted(each._replace(host=lines.get(each.listener, each.host)) for each in mismatches)
 
@@ -35,7 +38,14 @@ class Senders:
         routes = (route for route in self._program.table.routes if route.case.value == mismatch.payload_case)
         return list(dict.fromkeys(name for route in routes for name in sorted(self.sources[route.name] - {ANY})))
 
+    def is_learned(self, endpoint: str) -> bool:
+        """Whether the address of the endpoint is learned, perhaps not yet."""
+        return self._program.table.endpoints[endpoint].address.value.is_learned
+
     def host(self, endpoint: str) -> str:
+        """Return the host of an endpoint; "" before it is learned."""
+        if self.is_learned(endpoint):
+            return self._learned.get(endpoint, "").rpartition(":")[0]
         return self._program.table.endpoints[endpoint].address.value.host
 
     def in_place_of(self, endpoint: str) -> str | None:
@@ -55,9 +65,10 @@ class Senders:
             who = self._name_of(each.host)
             expected = self.expected(each)
             if each.host in map(self.host, expected):
-                sentences[f"{who} uses another port or listener than the table says"] = None
+                than = "before" if any(map(self.is_learned, expected)) else "the table says"
+                sentences[f"{who} uses another port or listener than {than}"] = None
             else:
-                others = " or ".join(f"{name} ({self.host(name)})" for name in expected)
+                others = " or ".join(f"{name} ({self.host(name) or 'not learned yet'})" for name in expected)
                 sentences[f"{who} sends messages expected from {others}"] = None
         cases = {each.payload_case for each in found}
         routes = tuple(route.name for route in self._program.table.routes if route.case.value in cases)

@@ -94,13 +94,17 @@ class Status:
         return {"numbers": [{"at": each.at, **numbers(each)} for each in self._health.look().snapshots]}
 
     def health(self) -> Json:
-        """Return all problems. `name`, `table`: file name and SHA-256 of the table. `received`: since the start."""
+        """Return all problems. `name`, `table`: file name and SHA-256 of the table. `received`: since the start.
+
+        `learned`: learned addresses, by endpoint.
+        """
         health = self._health.look()
         return {
             "name": health.program.table.path.name,
             "table": health.program.table.sha256,
             "received": health.now.total("datagrams_received"),
             "states": [asdict(state) for state in health.states],
+            "learned": dict(health.learned),
             "problems": [problem.json() for problem in health.problems],
         }
 
@@ -124,7 +128,7 @@ class Status:
 
 
 def numbers(now: Snapshot) -> Json:
-    """Return all metrics by route, endpoint, topic and listener. Times in seconds, counts since the start.
+    """Return all metrics by route, endpoint, topic and listener. Times in seconds, counts since the start, addresses.
 
     `routes` includes gateways. A route's `buckets` are cumulative, in the order of bounds.
     """
@@ -138,6 +142,8 @@ def numbers(now: Snapshot) -> Json:
                 for key in way:
                     place = place.setdefault(key, {})
                 place[last] = place.get(last, 0) + value
+    for endpoint, address in now.counts("endpoint_learned"):
+        found["endpoints"].setdefault(endpoint, {})["learned"] = address
     for (route, bound), value in now.counts(f"route_duration_seconds{BUCKETS}").items():
         found["routes"].setdefault(route, {}).setdefault("buckets", []).append([bound, value])
     for each in found["routes"].values():

@@ -19,6 +19,7 @@ METRICS = {kind.metric for kind in Kind} | {
     "deadman_datagrams_sent",
     "deadman_trips",
     "endpoint_last_silence_seconds",
+    "endpoint_learned",
     "endpoint_stale_after_seconds",
     "gateway_clients",
     "messages_filtered",

@@ -15,10 +15,11 @@ from router.compiler.compiled_table import CompiledTable, StatePlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.network import sent_by
+from router.compiler.resolution import stand_in
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields
-from router.table.addresses import BadAddressError, parse_address
+from router.table.addresses import Address, BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
@@ -119,6 +120,8 @@ class Step:
 
 _PORT = 40_000
 """A sender's port if the test gives none."""
+_LEARNED_HOST = "198.19.0.1"
+"""The host of endpoints whose address is learned, unless their networks exclude it: one for benchmarks."""
 
 
 class Names:
@@ -159,6 +162,9 @@ class Names:
     def peer(self, name: str, span: SourceSpan) -> Peer:
         """Return the address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
+            if endpoint.address.value.is_learned:
+                port = endpoint.source_port.value if endpoint.source_port else _PORT
+                return stand_in(self._table, endpoint, _LEARNED_HOST), port
             return sent_by(endpoint)
         host, colon, port = name.partition(":")
         try:

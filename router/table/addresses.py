@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Address(NamedTuple):
-    """An IPv4 address, or the host name of an endpoint, and a UDP (for metrics: TCP) port."""
+    """An IPv4 address and a UDP (for metrics: TCP) port. That of an endpoint may be a host name, or LEARNED."""
 
     host: str
     port: int
@@ -27,10 +27,23 @@ class Address(NamedTuple):
     @property
     def is_name(self) -> bool:
         """Whether the host is a name that is not resolved."""
-        return not self.host.replace(".", "").isdigit()
+        return not self.is_known and not self.is_learned
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the address is that of whoever sends first."""
+        return self == LEARNED
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is an IPv4 address."""
+        return self.host.replace(".", "").isdigit()
 
     def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
+        return self.host if self.is_learned else f"{self.host}:{self.port}"
+
+
+LEARNED = Address("learned", 0)
 
 
 class SerialPlace(Address):
@@ -91,7 +104,9 @@ def parse_remote(text: str) -> Address:
 
 
 def parse_endpoint(text: str) -> Address:
-    """Parse the address of a single machine, or its host name and a port. Raises BadAddressError."""
+    """Parse the address of a single machine, its host name and a port, or `learned`. Raises BadAddressError."""
+    if text == LEARNED.host:
+        return LEARNED
     host, _, port = text.rpartition(":")
     if NAME.fullmatch(host) and len(host) <= _LONGEST_NAME:
         return Address(host.lower(), parse_address(f"127.0.0.1:{port}").port)

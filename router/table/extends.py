@@ -5,7 +5,8 @@ Mappings merge key by key; everything else is replaced. These mappings are also 
 two files ignores; a deadman that only one of them disables with `none`; a route from endpoints by one from topics, and
 the reverse; the payloads of a deadman, unless both files have the same cases in the same order; what shows that a
 deadman is obeyed, unless the case is the same; and the transport of a gateway. `topic` and `topics` of a route replace
-each other, and so do `address`, `group` and `broadcast` of an endpoint. Every node keeps the span of its own file.
+each other, and so do `address`, `group` and `broadcast` of an endpoint, with the keys that belong to them. Every node
+keeps the span of its own file.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ _WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
 _ALTERNATIVES: Mapping[str, Mapping[str, Collection[str]]] = {
     "routes": {"topic": ["topics"], "topics": ["topic"]},
     "endpoints": {
-        "address": ["group", "interface", "hops", "broadcast"],
-        "group": ["address", "broadcast"],
-        "broadcast": ["address", "group", "interface", "hops"],
+        "address": ["networks", "group", "interface", "hops", "broadcast"],
+        "group": ["address", "networks", "broadcast"],
+        "broadcast": ["address", "networks", "group", "interface", "hops"],
     },
 }
 """Keys of a route or an endpoint, each with those that it replaces."""

@@ -68,6 +68,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     found = Names(program)
     yield from found.results()
     yield from endpoints(found.program, _in_place_of(running))
+    yield from _learned(program, running)
     yield from _running(program, running)
 
 
@@ -139,6 +140,18 @@ def _reported(program: CompiledTable, running: Health) -> Iterator[CheckResult]:
         yield grade("router", reported.text, f"{reported.remedy} See {page(reported.page)}")
     if all(reported.kind.level is Level.CALM for reported in running.problems):
         yield fine("router", f"it runs and loses nothing; {plural(running.received, 'datagram')} received")
+
+
+def _learned(program: CompiledTable, running: Health | None) -> Iterator[CheckResult]:
+    """Yield where the running router has learned endpoints to be."""
+    for endpoint in program.table.endpoints.values() if running is not None else ():
+        if not endpoint.address.value.is_learned or running is None:
+            continue
+        if endpoint.name in running.learned:
+            yield fine("endpoints", f"{endpoint.name}: learned at {running.learned[endpoint.name]}")
+        else:
+            what = f"{endpoint.name}: its address is not learned yet, so it gets nothing"
+            yield warning("endpoints", what, "it is learned from the first message for a route with this source")
 
 
 def _in_place_of(running: Health | None) -> Mapping[str, str]:

@@ -344,7 +344,7 @@ def ways(program: CompiledTable, grade: Callable[[str, str, str], CheckResult]) 
     """Check that an IP route leads to each endpoint. `grade` makes the result if none does."""
     for endpoint in _on_udp(program):
         address = endpoint.address.value
-        if address.is_name:
+        if not address.is_known:
             continue
         try:
             unreachable = why_no_way(endpoint)
@@ -390,7 +390,7 @@ def _on_udp(program: CompiledTable) -> list[Endpoint]:
 
 def _has_way(endpoint: Endpoint) -> bool:
     try:
-        return not endpoint.address.value.is_name and why_no_way(endpoint) is None
+        return endpoint.address.value.is_known and why_no_way(endpoint) is None
     except BadAddressError:
         return False
 

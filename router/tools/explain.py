@@ -183,6 +183,9 @@ def _source(name: str, table: RouteTable) -> str:
         return name
     endpoint = table.endpoints[name]
     port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
+    if endpoint.address.value.is_learned:
+        port = f" from port {endpoint.source_port.value}" if endpoint.source_port else ""
+        port += f" in {', '.join(map(str, endpoint.networks))}" if endpoint.networks else ""
     by = f" by listener {endpoint.listener.value}" if endpoint.listener else ""
     return f"{name} ({endpoint.address.value.host}{port}{by})"
 

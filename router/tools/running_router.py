@@ -8,7 +8,7 @@ import json
 import re
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from email.message import Message
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,13 +41,14 @@ class Answer(NamedTuple):
 class Health(NamedTuple):
     """What is wrong with a router, which table it runs (file name and SHA-256), and the datagrams it has received.
 
-    `states` are those of the table.
+    `states` are those of the table, `learned` the learned addresses, by endpoint.
     """
 
     name: str
     table_sha256: str
     received: int
     states: tuple[StateReading, ...]
+    learned: Mapping[str, str]
     problems: tuple[Problem, ...]
 
     @property
@@ -106,8 +107,9 @@ def health(url: str) -> Health:
         answer = json.loads(text)
         states = tuple(StateReading(**state) for state in answer["states"])
         problems = tuple(map(Problem.of, answer["problems"]))
-        return Health(answer["name"], answer["table"], answer["received"], states, problems)
-    except (ValueError, LookupError, TypeError) as error:
+        learned = {name: str(address) for name, address in answer["learned"].items()}
+        return Health(answer["name"], answer["table"], answer["received"], states, learned, problems)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.expressions.tree import ENVELOPE, MESSAGE
+from router.compiler.resolution import stand_in
 from router.datagrams import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address
@@ -217,6 +218,7 @@ class Simulator:
         played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
+        self._table = table
         self._streams = tuple(streams(wire, table, seed, speed))
         self._numbers = [0] * len(self._streams)
         self._silences = silences
@@ -252,7 +254,10 @@ class Simulator:
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
-        address = located(endpoint.address.value)
+        port = endpoint.source_port.value if endpoint.source_port else 0
+        is_learned = endpoint.address.value.is_learned
+        own = Address(stand_in(self._table, endpoint, LOOPBACK), port) if is_learned else endpoint.address.value
+        address = located(own)
         receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)

@@ -53,7 +53,8 @@ def origin(text: str, table: RouteTable | None) -> Address:
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
         address = _of_udp(endpoint.address.value, text)
-        return Address(located(address).host, endpoint.source_port.value if endpoint.source_port else 0)
+        own = ANYWHERE if address.is_learned else located(address)
+        return own._replace(port=endpoint.source_port.value if endpoint.source_port else 0)
     host, colon, port = text.partition(":")
     if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
         raise _not_a_place(text, table, "HOST[:PORT]")
@@ -150,7 +151,10 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
 
 
 def located(address: Address) -> Address:
-    """Return an address with an IPv4 address in place of its host name. Raises UsageError."""
+    """Return an address with an IPv4 address in place of its host name. Raises UsageError for one that is learned."""
+    if address.is_learned:
+        what = "the table has no address of this endpoint: a running router learns it"
+        raise UsageError(what, "write HOST:PORT; `router status` shows the one that was learned")
     return address._replace(host=_resolve(address.host)) if address.is_name else address
 
 

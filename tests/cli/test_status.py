@@ -68,6 +68,14 @@ def test_the_line_has_the_states_of_the_table(capsys: pytest.CaptureFixture[str]
     assert state == {"name": "mode", "value": "MODE_AUTO", "setter": "basestation", "age": 0.5, "is_valid": True}
 
 
+def test_the_line_has_the_learned_addresses(capsys: pytest.CaptureFixture[str]) -> None:
+    with answering("", learned={"tablet": "10.0.0.5:9000"}) as url:
+        assert main(["status", "--url", url]) == OK
+        assert capsys.readouterr().out == "running: tablet is at 10.0.0.5:9000; 7 datagrams received\n"
+        assert main(["status", "--url", url, "--json"]) == OK
+    assert json.loads(capsys.readouterr().out)["learned"] == {"tablet": "10.0.0.5:9000"}
+
+
 def test_something_else_at_the_address_is_no_router(capsys: pytest.CaptureFixture[str]) -> None:
     with answering("starting", status=503) as url:
         assert main(["status", "--url", url]) == NETWORK_FAULT

@@ -193,6 +193,16 @@ def test_address_group_and_broadcast_of_an_endpoint_replace_each_other(tmp_path:
     assert endpoint.interface == ("lo" if "group" in one and "group" in other else None)
 
 
+def test_an_address_replaces_the_networks_in_which_it_was_learned(tmp_path: Path) -> None:
+    learned = "address: learned, networks: [10.0.0.0/8], kind: tool"
+    (tmp_path / "base.yaml").write_text(GOOD.replace("endpoints:\n", f"endpoints:\n  tracker: {{{learned}}}\n"))
+    for other in ("address: 127.0.0.3:9", "group: '224.5.23.3:9'", "broadcast: 127.255.255.255:9"):
+        endpoint = good(tmp_path, f"extends: base.yaml\nendpoints: {{tracker: {{{other}}}}}\n").endpoints["tracker"]
+        assert (endpoint.address.value.is_learned, endpoint.networks) == (False, ())
+    endpoint = good(tmp_path, "extends: base.yaml\nendpoints: {tracker: {source_port: 9}}\n").endpoints["tracker"]
+    assert (endpoint.address.value.is_learned, len(endpoint.networks)) == (True, 1)
+
+
 def test_a_map_of_values_an_each_and_a_quality_of_service_replace(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text(
         GOOD

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -23,6 +23,7 @@ def answering(
     status: int = 200,
     problems: Sequence[Problem] = (),
     states: Sequence[StateReading] = (),
+    learned: Mapping[str, str] | None = None,
     table: str = "",
     health: str | None = None,
 ) -> Iterator[str]:
@@ -33,7 +34,8 @@ def answering(
     if health is None:
         listed = [problem.json() for problem in problems]
         shown = [asdict(state) for state in states]
-        health = json.dumps({"name": "rover.yaml", "table": table, "received": 7, "states": shown, "problems": listed})
+        known = {"name": "rover.yaml", "table": table, "received": 7, "states": shown, "learned": learned or {}}
+        health = json.dumps({**known, "problems": listed})
     answers = {"/metrics": text, "/health.json": health}
 
     class Handler(BaseHTTPRequestHandler):

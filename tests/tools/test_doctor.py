@@ -496,10 +496,11 @@ def test_who_answers_a_ping() -> None:
 
 
 @contextmanager
-def serving(program: CompiledTable, *problems: Problem) -> Iterator[None]:
-    """A router that runs the program's table, and in which this is wrong."""
-    assert program.table.http is not None
-    with answering("", program.table.http.address.value, problems=problems, table=program.table.sha256):
+def serving(program: CompiledTable, *problems: Problem, **learned: str) -> Iterator[None]:
+    """A router that runs the program's table, in which this is wrong, and which has learned these addresses."""
+    table = program.table
+    assert table.http is not None
+    with answering("", table.http.address.value, problems=problems, learned=learned, table=table.sha256):
         yield
 
 
@@ -520,6 +521,17 @@ def test_another_program_at_the_routers_address_has_its_port(table: Path, text: 
 def test_a_healthy_router_is_fine(table: Path) -> None:
     with serving(compiled(table)):
         assert gist(told(table), "7 datagrams received") == [(Grade.FINE, True)]
+
+
+def test_the_addresses_that_a_running_router_has_learned_are_told(table: Path) -> None:
+    program = rewritten(table, '"127.0.0.30:8"', "learned, because: a test")
+    with serving(program, sensor_board="127.0.0.41:9000"):
+        found = [each for each in examine(table, {}) if each.text.startswith("sensor_board")]
+    assert [each[:3] for each in found] == [(Grade.FINE, "endpoints", "sensor_board: learned at 127.0.0.41:9000")]
+    with serving(program):
+        [missing] = [each for each in examine(table, {}) if each.text.startswith("sensor_board")]
+    assert missing.grade is Grade.WARNING
+    assert not [each for each in examine(table, {}) if each.text.startswith("sensor_board")]
 
 
 def test_what_is_wrong_with_a_running_router_is_told_with_its_remedy_and_page(table: Path) -> None:

@@ -3,10 +3,11 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,28 @@ def test_an_endpoint_with_a_source_port_sends_from_it(wire: Wire, table_path: Ca
         peers = set()
         while ("127.0.6.10", station.source_port.value) not in peers:
             peers.add(router.recvfrom(2000)[1])
+
+
+@pytest.mark.parametrize(("networks", "host"), [("", LOOPBACK), (", networks: [127.0.6.8/29]", "127.0.6.9")])
+def test_an_endpoint_whose_address_is_learned_sends_from_where_it_can_be_learned(
+    wire: Wire, table_path: Callable[..., Path], networks: str, host: str
+) -> None:
+    path = table_path(source_port=True)
+    path.write_text(re.sub(r"127\.0\.6\.10:\d+", f"learned{networks}", path.read_text()))
+    table = read_table(path)
+    station = table.endpoints["station"]
+    assert station.source_port is not None
+    with played(wire, table) as (simulator, router):
+        place, inbox = (host, station.source_port.value), simulator.statistics.inboxes["station"]
+
+        def is_answered() -> bool:
+            with suppress(BlockingIOError):
+                data, peer = router.recvfrom(2000)
+                if peer == place:
+                    router.sendto(data, peer)
+            return bool(inbox.arrivals)
+
+        simulate(simulator, is_answered)
 
 
 def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTable) -> None:

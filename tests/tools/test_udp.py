@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -58,6 +59,21 @@ def test_an_endpoint_known_by_its_source_port_sends_from_it(table_path: Callable
     name_of = udp.peer_names(table)
     assert name_of(("127.0.6.10", source_port.value)) == "station"
     assert name_of(("127.0.6.10", 1)) == "127.0.6.10:1"
+
+
+def test_an_endpoint_whose_address_is_learned_sends_from_anywhere_and_has_no_address(
+    table_path: Callable[..., Path],
+) -> None:
+    path = table_path(source_port=True)
+    path.write_text(re.sub(r"127\.0\.6\.10:\d+", "learned", path.read_text()))
+    table = read_table(path)
+    source_port = table.endpoints["station"].source_port
+    assert source_port is not None
+    assert udp.origin("station", table) == Address("0.0.0.0", source_port.value)
+    for parse in (udp.destination, udp.listening):
+        with pytest.raises(UsageError, match="the table has no address of this endpoint"):
+            parse("station", table)
+    assert udp.peer_names(table)(("127.0.6.10", source_port.value)) == f"127.0.6.10:{source_port.value}"
 
 
 def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> None:

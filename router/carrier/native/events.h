@@ -17,7 +17,8 @@ enum event_kind {
     EVENT_EVIDENCE,
     EVENT_RETURNED,
     EVENT_STATE,
-    EVENT_LINK
+    EVENT_LINK,
+    EVENT_LEARNED
 };
 
 /* The beginning of every event. */
@@ -51,6 +52,12 @@ struct returned_event {
     uint32_t size, kind; /* EVENT_RETURNED: an endpoint is heard again */
     uint32_t endpoint, reserved;
     int64_t silence;     /* ns */
+};
+
+struct learned_event {
+    uint32_t size, kind;     /* EVENT_LEARNED: the address of an endpoint was learned, or a reload has excluded it */
+    uint32_t endpoint, reserved;
+    uint64_t before, after;  /* as in struct learned_peer */
 };
 
 enum { STATE_WORDS = 4, MOST_STATE_TEXT = STATE_WORDS * 8 }; /* bytes of a text */

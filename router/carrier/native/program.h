@@ -73,6 +73,22 @@ struct peer {
     int64_t pause;    /* ns: a longer one is a silence */
 };
 
+struct network {
+    uint32_t address, mask; /* host byte order */
+};
+
+/* An endpoint whose address is learned (learn.h), as a listener identifies it. */
+struct learned_peer {
+    struct peer peer;        /* its address and port are not used */
+    struct sender *sender;   /* NULL if nothing is sent to it */
+    const struct network *networks;
+    uint32_t network_count;  /* 0: its address may be any */
+    uint32_t port;           /* that it sends from; 0: any */
+    uint32_t origin;         /* counter: the learned address (times 65536) and port; 0 for none */
+    uint32_t reserved;
+    int64_t stale_after;     /* ns of silence after which another sender may take its place; NEVER */
+};
+
 struct listener {
     int32_t fd;  /* -1 for a link */
     uint32_t id; /* in events and mirror records */
@@ -81,8 +97,9 @@ struct listener {
     const struct protocol *protocol;
     struct link *link; /* NULL for a socket */
     const struct peer *peers; /* by address; for one address, those with a port first */
+    const struct learned_peer *learned;
     const struct choice *choices; /* `columns` for each row; the last one is for strangers */
-    uint32_t peer_count, columns;
+    uint32_t peer_count, learned_count, columns, reserved;
     uint32_t received, received_bytes, padded, superseded, rejected[REASONS]; /* counters */
 };
 

@@ -7,6 +7,7 @@
 #include "each.h"
 #include "evaluate.h"
 #include "events.h"
+#include "learn.h"
 
 /* ---- events ---- */
 
@@ -200,7 +201,7 @@ static bool is_in_order(struct routing *routing, const struct route *route, cons
     return lose_for_all(routing, route, received, DROP_OUT_OF_ORDER, &numbers);
 }
 
-/* ---- routing ---- */
+/* ---- senders and payload cases ---- */
 
 /* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. */
 static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
@@ -226,6 +227,52 @@ static const struct payload_case *find_case(const struct protocol *protocol, uin
     }
     return &protocol->cases[low]; /* envelope_read returns no other number */
 }
+
+/* ---- learned endpoints ---- */
+
+static bool names_sender(const struct listener *listener, uint32_t number, uint32_t column) {
+    const struct payload_case *found = find_case(listener->protocol, number);
+    if (found->row < 0) return false;
+    const struct choice *choices = &listener->choices[(uint32_t)found->row * listener->columns];
+    return choices[column].route != choices[listener->columns - 1].route; /* the last one is for strangers */
+}
+
+/* Whether the datagram has a message for a route that names the endpoint in this column. */
+static bool is_for_route_of(struct routing *routing, const struct received *received, uint32_t column) {
+    const struct listener *listener = received->listener;
+    const struct wire_schema *schema = &listener->protocol->schema;
+    struct envelope envelope;
+    if (envelope_read(schema, routing->datagram, received->length, listener->repairs, &envelope) != ROUTED) return false;
+    if (!envelope.others || schema->case_by != BY_CASES) return names_sender(listener, envelope.case_number, column);
+    struct bytes frame = {routing->datagram, routing->datagram + envelope.size};
+    for (uint32_t number = 0; envelope_part(schema, frame, number, routing->frame, &envelope); number = envelope.case_number)
+        if (names_sender(listener, envelope.case_number, column)) return true;
+    return false;
+}
+
+/* Return the learned endpoint that the datagram is from, which may be learned from it; NULL for a stranger. */
+static __attribute__((noinline)) const struct peer *find_learned(struct routing *routing, const struct received *received) {
+    const struct listener *listener = received->listener;
+    struct origin origin = {received->address, received->port};
+    const struct peer *known = learned_at(&routing->env, listener, origin);
+    for (uint32_t index = 0; !known && index < listener->learned_count; index++) {
+        const struct learned_peer *learned = &listener->learned[index];
+        if (!may_learn(&routing->env, learned, origin, received->now)) continue;
+        if (!is_for_route_of(routing, received, learned->peer.column)) continue;
+        learn(&routing->env, learned, origin);
+        known = &learned->peer;
+    }
+    return known;
+}
+
+static void adopt_learned(struct thread_env *env, const struct listener *listener) {
+    for (uint32_t index = 0; index < listener->learned_count; index++) {
+        struct origin origin = learned_origin(env, &listener->learned[index]);
+        learned_adopt(env, &listener->learned[index], find_peer(listener, origin.address, origin.port) != NULL);
+    }
+}
+
+/* ---- routes ---- */
 
 /* Return the index of the route with `order` that the datagram passes; NO_ROUTE, or ORDERED if it is lost. It is not inlined, as
  * other routes do not pay for it. */
@@ -322,6 +369,7 @@ int route_datagram(struct routing *routing, struct received *received) {
     env_count(&routing->env, listener->received, 1);
     env_count(&routing->env, listener->received_bytes, (int64_t)received->length);
     received->peer = find_peer(listener, received->address, received->port);
+    if (!received->peer && listener->learned_count) received->peer = find_learned(routing, received);
     received->column = received->peer ? received->peer->column : listener->columns - 1;
     received->route = NULL;
     if (received->peer) hear(routing, received);
@@ -350,6 +398,8 @@ void routing_adopt(struct routing *routing, const struct change *change) {
         deadman_replace(routing->env.timers, change->replaced[2 * index], change->replaced[2 * index + 1]);
     timers_change(routing->env.timers, &change->timers);
     states_adopt(routing->env.timers, change->program->states, change->program->state_count);
+    for (uint32_t index = 0; index < change->program->listener_count; index++)
+        adopt_learned(&routing->env, &change->program->listeners[index]);
     routing->program = change->program;
 }
 

@@ -1,5 +1,6 @@
 #include "simulation.h"
 
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -75,6 +76,7 @@ static int64_t simulated_wall(struct thread_env *env) { return env->simulation->
 static int send_nowhere(struct thread_env *env, const struct target *target, const uint8_t *data, size_t size, int64_t expires) {
     int64_t now = env->simulation->now;
     if (now > expires) return COMMAND_STALE;
+    if (!sender_has_address(target->sender)) return EDESTADDRREQ;
     if (target->beside) beside_fill(target->beside, data, env->wall(env));
     note_output(env, RECORD_SENT, target->id, data, size);
     if (target->feed_count) command_has_left(env->simulation->timers, target->feeds, target->feed_count, 0, now);
@@ -83,6 +85,7 @@ static int send_nowhere(struct thread_env *env, const struct target *target, con
 
 static int brake_nowhere(struct thread_env *env, const struct deadman_destination *to,
                          const struct deadman_datagram *datagram) {
+    if (!sender_has_address(to->sender)) return EDESTADDRREQ;
     note_output(env, RECORD_BRAKED, to->id, datagram->data, datagram->size);
     return 0;
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from router.table.addresses import LEARNED
 from router.table.build import DEFAULT_FORMATS
 from router.table.grammar.keys import Schema, key, ref, required
 from router.table.model.endpoints import Endpoint, Listener
@@ -177,6 +178,10 @@ ENDPOINT: Sequence[Schema] = [
     {
         "if": {"required": ["broadcast"]},
         "then": without("address", "is not allowed with 'broadcast'; an endpoint has one destination"),
+    },
+    {
+        "if": _has(address={"anyOf": [{"enum": [LEARNED.host]}, ref("variable")]}),
+        "else": without("networks", "needs 'address: learned': an address that is written is in one network"),
     },
 ]
 

@@ -70,8 +70,8 @@ VALUES: Schema = {
     "variable": {"type": "string", "pattern": _VARIABLE},
     "address": _text(f"^{_HOST}:{_PORT}$", "be an IPv4 address and a port, such as '192.168.0.30:8'"),
     "endpoint_address": _text(
-        rf"^(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}$",
-        "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8'",
+        rf"^(?:(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}|learned)$",
+        "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8', or 'learned'",
     ),
     "device": _text(r"^/\S+$", "be the path of a device, such as '/dev/serial/by-id/usb-board-if00'"),
     "stream_framing": {

@@ -2,11 +2,12 @@
 
 import enum
 from dataclasses import dataclass, field
+from ipaddress import IPv4Network
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
 from router.table.addresses import BROADCAST, ENDPOINT, GROUP, LOCAL, Address
-from router.table.keys import Listed, Named, Range, Shape
+from router.table.keys import SOME, Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.model.serial import SerialLine
 from router.table.units import DATA_RATE, PATIENCE, SIZE
@@ -96,11 +97,25 @@ class Endpoint:
     span: SourceSpan
     unicast: Annotated[Located[Address] | None, ENDPOINT, Named("address")] = None
     """Where datagrams to it are sent. Datagrams from it are recognised by the IP address. The running router resolves
-    a host name, again and again. The other end of a serial line has none.
+    a host name, again and again. learned: the address and port of the first sender of a message for a route with this
+    source, until that sender has been silent for longer than `stale_after`. The other end of a serial line has none.
 
     Title: Endpoint address
     Example: 192.168.0.30:8
     Example: robot3.local:50052
+    Example: learned
+    """
+    networks: Annotated[tuple[IPv4Network, ...], SOME] = ()
+    """Learn the address only in these networks. Default: the `networks` of the table, or else any.
+
+    Title: Networks to learn in
+    Example: [192.168.0.0/24]
+    """
+    because: Annotated[str | None, Shape("reason")] = None
+    """Why the address of a board may be learned: any computer that can send to the listener may then get its commands,
+    also those that brake.
+
+    Example: the cable leads to nothing but the board, which has DHCP
     """
     group: Annotated[Located[Address] | None, GROUP] = None
     """In place of `address`: the multicast group and port that datagrams are sent to. It is no sender, and no board.
