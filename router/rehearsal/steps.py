@@ -19,7 +19,7 @@ from router.compiler.resolution import stand_in
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields
-from router.table.addresses import Address, BadAddressError, parse_address
+from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
