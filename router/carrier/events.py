@@ -126,8 +126,8 @@ class EventReader:
             return Returned(self._name(returned.endpoint), returned.silence / 1e9)
         if kind == EventKind.LEARNED:
             learned = LearnedEvent.from_buffer(record)
-            before, after = (origin_text(at) if at else "" for at in (learned.before, learned.after))
-            return Learned(self._name(learned.endpoint), before, after)
+            earlier, present = (origin_text(at) if at else "" for at in (learned.before, learned.after))
+            return Learned(self._name(learned.endpoint), earlier, present)
         if kind == EventKind.STATE:
             changed = StateEvent.from_buffer(record)
             source = self._name(changed.source) if changed.source != NO_NAME else None

@@ -163,8 +163,8 @@ class Names:
         """Return the address that an endpoint sends from, or an address written HOST:PORT."""
         if endpoint := self._table.endpoints.get(name):
             if endpoint.address.value.is_learned:
-                port = endpoint.source_port.value if endpoint.source_port else _PORT
-                return stand_in(self._table, endpoint, _LEARNED_HOST), port
+                source_port = endpoint.source_port.value if endpoint.source_port else _PORT
+                return stand_in(self._table, endpoint, _LEARNED_HOST), source_port
             return sent_by(endpoint)
         host, colon, port = name.partition(":")
         try:

@@ -221,7 +221,8 @@ def test_a_payload_that_only_others_may_send_is_told_by_the_name_of_the_board(si
         site.board.await_frames(1)
         site.board.send(DRIVE)
         wait_until(lambda: any("from the serial line" in each.get("detail", "") for each in log))
-        assert Senders(router.program, router.mismatches().keys()).of("manual_drive") == [f"board ({site.board.path})"]
+        senders = Senders(router.program, router.mismatches().keys(), {})
+        assert senders.of("manual_drive") == [f"board ({site.board.path})"]
 
 
 def test_a_frame_is_as_old_as_its_first_byte(site: Site) -> None:
