@@ -34,7 +34,7 @@ def envelope_class(table: Path) -> type[Message]:
     program = check_table(table, {}).program
     if program is None:
         raise SystemExit(f"{table} has errors; see `router validate`")
-    return program.envelope.message_class
+    return program.envelopes.first.message_class
 
 
 def stamp() -> int:

@@ -30,11 +30,11 @@ def fuzz(schema: str, count: int, seed: int, found: Callable[[str], None]) -> Co
         made = table(schema, Path(folder))
         carrier = CarrierSide(native_library(), made)
     noise = random.Random(seed)
-    maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
+    maker = Maker(made.envelopes.first.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
     decisions: Counter[str] = Counter()
     for _ in range(count):
         data, repairs = maker.datagram(), noise.random() < 0.7
-        expected = decide(made.envelope, made.inbound, data, MAX_DATAGRAM, repairs)
+        expected = decide(made.envelopes.first, made.inbound, data, MAX_DATAGRAM, repairs)
         decided = carrier.decide(data, repairs)
         decisions[expected.reason or "accepted"] += 1
         if decided != expected:

@@ -33,18 +33,18 @@ def differing(case: str, count: int, start: Site, end: Site) -> int:
 
 
 def run(count: int) -> bool:
-    each = -(-count // (2 * len(WIRE.envelope.cases)))
+    each = -(-count // (2 * len(WIRE.envelopes.first.cases)))
     print(f"{'payload case':22}{'messages':>10}{'different':>11}{'seconds':>9}")
     wrong = 0
     with tempfile.TemporaryDirectory() as folder, back_to_back(Path(folder)) as (left, right):
-        for case in WIRE.envelope.cases:
+        for case in WIRE.envelopes.first.cases:
             begin = time.monotonic()
             found = differing(case, each, left, right) + differing(case, each, right, left)
             print(f"{case:22}{2 * each:10}{found:11}{time.monotonic() - begin:9.2f}", flush=True)
             wrong += found
         lost = sum(total(place.scrape(), "messages_dropped") for place in (left, right))
         left_over = sum(len(place.waiting()) for place in (left, right))
-    print(f"{'all':22}{2 * each * len(WIRE.envelope.cases):10}{wrong:11}; {lost} dropped")
+    print(f"{'all':22}{2 * each * len(WIRE.envelopes.first.cases):10}{wrong:11}; {lost} dropped")
     return wrong == lost == left_over == 0
 
 

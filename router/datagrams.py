@@ -11,12 +11,14 @@ from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.declared import MAX_DATAGRAM
-from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
+from router.errors import DecodeError, Located, SourceSpan, UsageError, shown_path
 from router.table.model import RouteTable
+from router.table.model.settings import EnvelopeSettings
 from router.types.envelopes import chosen_envelope
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
+from router.types.table_envelopes import Envelopes
 from router.types.wire import read_varint
 
 Peer = tuple[str, int]
@@ -38,16 +40,15 @@ class Decoded:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """The wire format of an envelope and its payload cases."""
+    """The wire format of envelopes and their payload cases."""
 
-    envelope: Envelope
+    envelopes: Envelopes
 
     def case(self, name: str) -> PayloadCase:
         """Return a payload case. Raises UsageError if it does not exist."""
-        if name not in self.envelope.cases:
-            hint = did_you_mean(name, self.envelope.cases)
-            raise UsageError(f"{self.envelope.name} has no payload case '{name}'", hint)
-        return self.envelope.cases[name]
+        if name not in self.envelopes.cases:
+            raise UsageError(*self.envelopes.unknown_case(name))
+        return self.envelopes.cases[name]
 
     def encode(self, case: PayloadCase, payload: Message, beside: Message | None = None) -> bytes:
         """Return the exact encoding of an envelope with this payload, and with the other fields of `beside`.
@@ -57,54 +58,58 @@ class Wire:
         if not payload.IsInitialized():
             fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
             raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
-        return self.envelope.around(case, payload, beside).SerializePartialToString()
+        return self.envelopes.of(case.name).around(case, payload, beside).SerializePartialToString()
 
-    def decode(self, datagram: bytes) -> Decoded:
-        """Parse a datagram as a listener with `framing: zero_trimmed` does.
+    def decode(self, datagram: bytes, envelope: Envelope | None = None) -> Decoded:
+        """Parse a datagram as a listener with `framing: zero_trimmed` does; `envelope` is the only one by default.
 
         Of one with several messages, return the first. Raises DecodeError, which begins with the reason under which
         the router counts such a datagram.
         """
-        return self.decode_all(datagram)[0]
+        return self.decode_all(datagram, envelope)[0]
 
-    def decode_all(self, datagram: bytes) -> list[Decoded]:
+    def decode_all(self, datagram: bytes, envelope: Envelope | None = None) -> list[Decoded]:
         """Like `decode`, but return all messages of the datagram."""
         if len(datagram) > MAX_DATAGRAM:
             raise DecodeError(f"truncated: {len(datagram)} bytes; the limit is {MAX_DATAGRAM}")
-        whole = restored(datagram)
+        whole, envelope = restored(datagram), envelope or self.envelopes.first
         try:
-            outer = self.envelope.message_class.FromString(whole)
+            outer = envelope.message_class.FromString(whole)
         except ProtobufError as error:
-            raise DecodeError(f"malformed: {_why_malformed(self.envelope, datagram)}") from error
-        if not (members := self.envelope.members_of(outer)):
-            reason, detail = _why_no_payload(self.envelope, outer, datagram)
+            raise DecodeError(f"malformed: {_why_malformed(envelope, datagram)}") from error
+        if not (members := envelope.members_of(outer)):
+            reason, detail = _why_no_payload(envelope, outer, datagram)
             raise DecodeError(f"{reason}: {detail}" if detail else reason)
-        if (other := self.envelope.unroutable.get(members[0])) is not None:
+        if (other := envelope.unroutable.get(members[0])) is not None:
             raise DecodeError(f"unhandled: {members[0]} is {other.type}, not a message")
         try:
-            found = self.envelope.payloads_of(outer)
+            found = envelope.payloads_of(outer)
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_unparsed(members[0])}") from error
-        superseded = payloads(self.envelope, whole, repairs=False)[:-1] if len(found) == 1 else ()
+        superseded = payloads(envelope, whole, repairs=False)[:-1] if len(found) == 1 else ()
         return [Decoded(case, message, len(whole) - len(datagram), superseded) for case, message in found]
 
 
 def wire_of_table(table: RouteTable) -> Wire:
-    """Return the envelope of the table. Raises TableError, and UsageError if the table has none."""
-    if table.envelope is None:
+    """Return the envelopes of the table. Raises TableError, and UsageError if the table has none."""
+    if not table.envelopes:
         raise UsageError(f"{shown_path(table.path)} has no 'envelope', so there are no datagrams to build or parse")
-    settings = table.envelope
-    schema = load_protos(
-        settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
-    )
-    return Wire(chosen_envelope(schema, settings.choice))
+
+    def chosen(settings: EnvelopeSettings) -> Envelope:
+        schema = load_protos(
+            settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+        )
+        return chosen_envelope(schema, settings.choice)
+
+    by_name = {name: chosen(settings) for name, settings in table.envelopes.items()}
+    return Wire(Envelopes(by_name, *table.envelope_names))
 
 
 def wire_of_protos(root: Path) -> Wire:
     """Return the envelope `PBEnvelope.payload` of a folder of `.proto` files. Raises TableError."""
     span = SourceSpan(shown_path(root))
     schema = load_protos(Located(root, span), Located(ENVELOPE, span))
-    return Wire(find_envelope(schema, Located(ONEOF, span)))
+    return Wire(Envelopes({"": find_envelope(schema, Located(ONEOF, span))}))
 
 
 def framed(exact: bytes, trim: bool, pad: int) -> bytes:

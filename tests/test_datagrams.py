@@ -115,13 +115,13 @@ ALONE = "send the envelope alone"
 def test_what_firmware_does_with_an_envelope_is_recognised(wire: Wire, datagram: bytes, cause: str) -> None:
     with pytest.raises(DecodeError) as caught:
         wire.decode(datagram)
-    told = why_rejected(wire.envelope, datagram, len(datagram), repairs=True)
+    told = why_rejected(wire.envelopes.first, datagram, len(datagram), repairs=True)
     assert (str(caught.value), told.partition("; ")[2]) == (f"malformed: {told}", cause)
 
 
 def test_a_part_of_a_datagram_is_not_taken_for_another_one(wire: Wire) -> None:
     whole = ENVELOPE[2:] * 9
-    assert why_rejected(wire.envelope, whole[:5], len(whole), repairs=True) == "field 1 is not a message"
+    assert why_rejected(wire.envelopes.first, whole[:5], len(whole), repairs=True) == "field 1 is not a message"
 
 
 def test_a_datagram_that_the_router_would_not_take_is_not_decoded(wire: Wire) -> None:

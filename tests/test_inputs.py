@@ -76,7 +76,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def compiled(known: CompiledTable | None = None) -> tuple[CompiledTable, Plain]:
     with inputs.recording() as read:
-        definitions = Definitions(known.protos if known else None)
+        definitions = Definitions(known.envelopes.schemas if known else ())
         checked = check_table(Path("routes/rover.yaml"), None, definitions)
         program = checked.program
     assert program is not None, "\n".join(map(str, checked.diagnostics))
@@ -220,7 +220,7 @@ def test_a_change_that_keeps_the_size_is_found(
     program, plain = compiled()
     way(path, after)
     assert changed_in_new_process(plain) != ""
-    assert (compiled(program)[0].protos is program.protos) is ("protos" not in path)
+    assert (compiled(program)[0].envelopes.first.schema is program.envelopes.first.schema) is ("protos" not in path)
     assert not inputs.are_same(compiled()[1], plain)
     if way is not link_to_folder:
         Path(path).unlink()
@@ -285,7 +285,7 @@ def test_a_hidden_proto_that_another_imports_is_noted_although_protoc_alone_read
 def test_a_reload_that_takes_over_the_protos_notes_the_same_inputs_as_a_start() -> None:
     program, plain = compiled()
     again, after = compiled(program)
-    assert again.protos is program.protos
+    assert again.envelopes.first.schema is program.envelopes.first.schema
     assert inputs.are_same(after, plain)
 
 
@@ -294,7 +294,7 @@ def test_a_reload_compiles_the_protos_again_once_their_lock_has_changed() -> Non
     program, _ = compiled()
     assert main(["schema", "lock", "-t", "routes/rover.yaml"]) == 0
     again, after = compiled(program)
-    assert again.protos is not program.protos
+    assert again.envelopes.first.schema is not program.envelopes.first.schema
     assert inputs.are_same(after, compiled()[1])
 
 

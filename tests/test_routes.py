@@ -166,7 +166,7 @@ def published(rover: CompiledTable) -> Publish:
 
     def route(case: str, **values: object) -> dict[str, bytes]:
         rehearsal = Rehearsal(rover)
-        envelope = rover.envelope.message_class(**{case: values})
+        envelope = rover.envelopes.first.message_class(**{case: values})
         rehearsal.datagram("rover", SENSOR_BOARD, envelope.SerializeToString())
         assert not any(isinstance(event, Dropped) for event in rehearsal.events)
         return {event.target: event.data for event in rehearsal.events if isinstance(event, Published)}

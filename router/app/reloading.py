@@ -155,7 +155,7 @@ class Reloader:
         until = monotonic_ns() + round(UNCHANGED_TIMEOUT * 1e9)
         wait_until_unchanged(watched_files(now.table), until)
         while True:
-            checked = check_table(now.table.path, self._environ, Definitions(now.protos))
+            checked = check_table(now.table.path, self._environ, Definitions(now.envelopes.schemas))
             if checked.table is None or not wait_until_unchanged(watched_files(checked.table), until):
                 return checked  # else the files changed while they were read
 

@@ -100,14 +100,11 @@ class InterfaceWatcher:
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """Return the table, the tables it extends, Zenoh configurations, the lock file, and all files beside its protos."""
+    """Return the table, the tables it extends, Zenoh configurations, lock files, and all files beside protos."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
-    protos: Iterable[Path] = ()
-    if table.envelope is not None:
-        protos = walk(table.envelope.protos.value)
-        if table.envelope.lock is not None:
-            paths.append(table.envelope.lock.value)
+    protos = (path for envelope in table.envelopes.values() for path in walk(envelope.protos.value))
+    paths += [envelope.lock.value for envelope in table.envelopes.values() if envelope.lock is not None]
     return [*table.files, *paths, *protos]
 
 

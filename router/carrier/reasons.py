@@ -17,7 +17,7 @@ def why_rejected(program: CompiledTable, listener: str, data: bytes, length: int
     if plan is None:
         return ""
     repairs = plan.framing is Framing.ZERO_TRIMMED
-    return datagrams.why_rejected(program.envelope, data, length, repairs=repairs)
+    return datagrams.why_rejected(program.envelopes.at(listener), data, length, repairs=repairs)
 
 
 def superseded(program: CompiledTable, listener: str, data: bytes) -> str:
@@ -25,7 +25,9 @@ def superseded(program: CompiledTable, listener: str, data: bytes) -> str:
     plan = program.table.listeners.get(listener)
     if plan is None:
         return ""
-    return ", then ".join(datagrams.payloads(program.envelope, data, repairs=plan.framing is Framing.ZERO_TRIMMED))
+    return ", then ".join(
+        datagrams.payloads(program.envelopes.at(listener), data, repairs=plan.framing is Framing.ZERO_TRIMMED)
+    )
 
 
 def where_refused(program: CompiledTable, route: str, topic: str | None, target: str, place: int) -> str:

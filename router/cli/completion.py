@@ -43,8 +43,8 @@ def routed(args: argparse.Namespace, _: str = "") -> Iterator[str]:
 
 
 def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:
-    """Return the payload cases of the envelope."""
-    return _wire(args).envelope.cases
+    """Return the payload cases of the envelopes."""
+    return _wire(args).envelopes.cases
 
 
 def endpoints(args: argparse.Namespace, _: str = "") -> Iterable[str]:
@@ -100,7 +100,7 @@ def listened(args: argparse.Namespace, prefix: str) -> Iterable[str]:
 def fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
     """Return `accel_x=`, `bbox.x=` or `state=NAME` for the payload case given before."""
     case = getattr(args, "case", None) or args.names[0]
-    return _assignments(_wire(args).envelope.cases[case].type, prefix)
+    return _assignments(_wire(args).envelopes.cases[case].type, prefix)
 
 
 def _assignments(kind: MessageType, prefix: str) -> Iterator[str]:

@@ -78,7 +78,7 @@ def _simulated(program: CompiledTable) -> Iterator[Callable[[], None]]:
             failures.append(error)
             os.kill(os.getpid(), signal.SIGTERM)
 
-    simulator = Simulator(Wire(program.envelope), program.table, seed=1, deadmen=program.deadmen)
+    simulator = Simulator(Wire(program.envelopes), program.table, seed=1, deadmen=program.deadmen)
     # The thread inherits the signal mask, so that the main thread gets the signals.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1})
     thread = Thread(target=play, name="simulator")

@@ -102,10 +102,10 @@ def _propose(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.folder} cannot be written: {error.strerror or error}") from error
     checked = check_table(table)
     print(f"{shown_path(table)}: {envelope.message.name}, {plural(len(envelope.cases), 'payload case')}")
-    if checked.schema is not None and checked.envelope is not None:
-        lock = LockComparison(checked.schema, checked.envelope)
-        write_lock(checked.schema.lock, lock.extended())
-        print(f"{shown_path(checked.schema.lock)}: the lock of its field numbers")
+    if checked.envelopes is not None:
+        lock = LockComparison(checked.envelopes.first)
+        write_lock(lock.path, lock.extended())
+        print(f"{shown_path(lock.path)}: the lock of its field numbers")
     checked = check_table(table)
     print_findings([*schema.warnings, *checked.diagnostics], sys.stderr)
     print(_next_steps(args.folder, "router validate"))

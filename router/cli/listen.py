@@ -139,11 +139,13 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     from router.tools.tap import listen
 
     wire, table = load_wire(args, place)
-    with udp.open_udp(udp.listening(place, table), place, udp.endpoint_of(place, table)) as receiver:
+    address = udp.listening(place, table)
+    envelope = wire.envelopes.first if table is None else udp.received_at(address, table, wire.envelopes)
+    with udp.open_udp(address, place, udp.endpoint_of(place, table)) as receiver:
         host, port = receiver.getsockname()
         say(f"listening on {host}:{port}; press Ctrl-C to stop")
         with until_interrupted():
-            print_batches(listen(receiver, wire, udp.peer_names(table)), args)
+            print_batches(listen(receiver, wire, envelope, udp.peer_names(table)), args)
 
 
 def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:

@@ -69,7 +69,7 @@ def _record(args: argparse.Namespace) -> int:
     # The router has priority over observers on its computer.
     with background_threads(), tap(url) as batches:
         recording = TapRecording(
-            args.output or Path(f"{table.path.stem}_{time}.mcap"), wire_of_table(table).envelope, table
+            args.output or Path(f"{table.path.stem}_{time}.mcap"), wire_of_table(table).envelopes, table
         )
         print(f"recording the router at {url} to {recording.path}; press Ctrl-C to stop", file=sys.stderr, flush=True)
         try:

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
     )
     envelope = chosen_envelope(schema, settings.choice)
-    lock = LockComparison(schema, envelope, None if args.protos else table_path(args))
+    lock = LockComparison(envelope, None if args.protos else table_path(args))
     conflicts = lock.conflicts
     accepted = _accepted(args.accept, conflicts)
     if refused := [conflict for conflict in conflicts if conflict not in accepted]:
@@ -106,9 +106,9 @@ def _of_table(path: Path) -> EnvelopeSettings:
     table, findings = load_table(path)
     if table is None:
         raise TableError(findings)
-    if table.envelope is None:
+    if not table.envelopes:
         raise UsageError(f"{path} has no 'envelope'", "name the folder of the protos: --protos protos")
-    return table.envelope
+    return table.envelopes[""]
 
 
 def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock | None) -> EnvelopeSettings:

@@ -79,7 +79,8 @@ def _envelope(wire: Wire, name: str, words: Sequence[str]) -> bytes:
     from router.compiler.expressions.tree import ENVELOPE
     from router.values.reading import assigned, payload
 
-    case, envelope = wire.case(name), wire.envelope
+    case = wire.case(name)
+    envelope = wire.envelopes.of(name)
     prefix = f"{ENVELOPE}."
     is_beside = [word.startswith(prefix) and case.type.field(ENVELOPE) is None for word in words]
     inside = [word for word, beside in zip(words, is_beside, strict=True) if not beside]

@@ -58,13 +58,14 @@ def run(args: argparse.Namespace) -> int:
     from router.datagrams import Wire
     from router.recording.reader import Recording
     from router.recording.schemas import recorded_envelope
+    from router.types.table_envelopes import Envelopes
 
     if args.why and (args.cases or args.where):
         raise UsageError("--why explains whole stops", "leave out --case and --where")
     if args.margin is not None and args.around is None:
         raise UsageError("--margin is for --around", "give both")
     with closing(Recording(args.file)) as recording:
-        wire = Wire(recorded_envelope(recording.cases()))
+        wire = Wire(Envelopes({"": recorded_envelope(recording.cases())}))
         entries = in_order(recording.everything())
         first = next(entries, None)
         if first is None:
@@ -148,10 +149,10 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
     from router.recording.reader import RecordedAction
     from router.tools.tap import Condition, Filter, shown
 
-    cases = [wire.case(name) for name in args.cases] or list(wire.envelope.cases.values())
+    cases = [wire.case(name) for name in args.cases] or list(wire.envelopes.cases.values())
     if args.where and not cases:
         raise UsageError(f"{recording.path} has no payloads, so --where has none to look at")
-    condition = Condition(args.where, wire.envelope, cases) if args.where else None
+    condition = Condition(args.where, cases) if args.where else None
     chosen, span = Filter(args.cases, condition), _window(args, first)
     last, count = first.at, 0
 

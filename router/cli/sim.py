@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     silences = [parse_silence(text) for text in args.silent]
     obeys = parse_obedience(args.obey)
     checked, program = good_table(table_path(args))
-    wire = Wire(program.envelope)
+    wire = Wire(program.envelopes)
     simulator = Simulator(
         wire,
         program.table,

@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
     url = running_url(args)
     wire, _ = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
-    cases = cases or list(wire.envelope.cases.values())
-    condition = Condition(args.where, wire.envelope, cases) if args.where else None
+    cases = cases or list(wire.envelopes.cases.values())
+    condition = Condition(args.where, cases) if args.where else None
     taken = RunningTap(wire, Filter(args.cases, condition))
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router has priority over observers on its computer.

@@ -29,6 +29,7 @@ from router.types.board_limits import BoardField, BoardLimits, BoardMessage, sca
 from router.types.descriptors import container, message_of
 from router.types.model import Field, Float, Int, MessageType, Type
 from router.types.paths import type_at
+from router.types.protobuf import Envelope
 from router.types.wire import GROUP, GROUP_END, LEN, encoding_of, varint
 
 if TYPE_CHECKING:
@@ -76,12 +77,16 @@ class _Set:
         return self.lookup.boards.get(self.endpoint.name)
 
     @property
+    def _around(self) -> Envelope:
+        return self.lookup.envelopes.to(self.endpoint.name)
+
+    @property
     def _envelope(self) -> Descriptor:
-        return self.lookup.envelope.message_class.DESCRIPTOR  # type: ignore[return-value]  # of upb
+        return self._around.message_class.DESCRIPTOR  # type: ignore[return-value]  # of upb
 
     def checked(self) -> Beside | None:
         """Return None after findings about constants. Raises FindingError for any other mistake."""
-        lookup, envelope = self.lookup, self.lookup.envelope
+        lookup, envelope = self.lookup, self._around
         constants, changing, sources = [], dict[Path, Changing](), dict[str, Row]()
         if not envelope.beside.fields:
             message = f"{envelope.name} has no fields beside the payload"
@@ -180,7 +185,7 @@ class _Set:
         """Raise FindingError if the board cannot decode a constant."""
         if self.board is None:
             return
-        for field, value in scalars(self.lookup.envelope.message_class.FromString(data), self.board.fields):
+        for field, value in scalars(self._around.message_class.FromString(data), self.board.fields):
             if misfit := self.board.misfit(field, value):
                 what = f"'{self.endpoint.name}' rejects this: {misfit}"
                 raise FindingError(self.fields.span, Code.BOARD_PAYLOAD, what)

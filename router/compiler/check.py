@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -29,11 +29,19 @@ from router.table import in_order, load_table
 from router.table.model import RouteTable
 from router.table.model.endpoints import EndpointKind
 from router.table.model.targets import Topic
-from router.types.board_limits import MOST_LISTS, MOST_MESSAGES, BoardLimits, board_fields, payload_fields, places
+from router.types.board_limits import (
+    MOST_LISTS,
+    MOST_MESSAGES,
+    BoardLimits,
+    board_fields,
+    payload_fields,
+    places,
+)
 from router.types.envelopes import chosen_envelope
 from router.types.lock import LockComparison
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, ProtoSchema, without_protos
+from router.types.protobuf import Envelope, no_envelope
+from router.types.table_envelopes import Envelopes
 
 
 @contextmanager
@@ -55,8 +63,7 @@ class Checked:
     path: Path
     diagnostics: Sequence[Diagnostic]
     table: RouteTable | None = None
-    schema: ProtoSchema | None = None
-    envelope: Envelope | None = None
+    envelopes: Envelopes | None = None
     routes: Sequence[CheckedRoute] = ()
     gateways: Sequence[GatewayPlan] = ()
     boards: Mapping[str, BoardLimits] = field(default_factory=dict)
@@ -98,14 +105,15 @@ def check_table(
         return Checked(path, in_order(findings))
     definitions = definitions or Definitions()
     try:
-        schema, envelope = _wire(table, definitions)
+        envelopes = _envelopes(table, definitions)
     except TableError as error:
         return Checked(path, in_order([*findings, *error.diagnostics, *network_findings(table)]), table)
-    table = with_types(table, envelope.cases, findings)
-    lock = LockComparison(schema, envelope, path) if table.envelope else None
-    board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
-    boards = _boards(table, schema, envelope, board_limit)
-    lookup = Lookup(table, schema, envelope, definitions, board_limit, boards)
+    table = with_types(table, envelopes.cases, findings)
+    locks = {
+        name: LockComparison(envelope, path) for name, envelope in envelopes.by_name.items() if name in table.envelopes
+    }
+    boards = _boards(table, envelopes, locks)
+    lookup = Lookup(table, envelopes, definitions, boards)
     lookup.beside = check_beside(lookup)
     states = check_states(lookup)
     routes = check_routes(lookup)
@@ -114,8 +122,8 @@ def check_table(
     own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
-        *schema.warnings,
-        *(lock.findings(table.envelope.lock) if lock and table.envelope else ()),
+        *(warning for schema in envelopes.schemas for warning in schema.warnings),
+        *(finding for name, lock in locks.items() for finding in lock.findings(table.envelopes[name].lock)),
         *network_findings(table),
         *_board_findings(table, boards),
         *_envelope_findings(lookup, routes),
@@ -128,30 +136,42 @@ def check_table(
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
     if not _has_errors(findings):
-        lowered, limits = lower_table(routes, envelope, states)
+        lowered, limits = lower_table(routes, envelopes, states)
         findings += limits
         lowered = None if limits else lowered
-    schema.sources.close()
-    return Checked(
-        path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics, states, lowered
-    )
+    for schema in envelopes.schemas:
+        schema.sources.close()
+    return Checked(path, in_order(findings), table, envelopes, routes, gateways, boards, own_topics, states, lowered)
 
 
 def _has_errors(findings: Iterable[Diagnostic]) -> bool:
     return any(finding.severity is Severity.ERROR for finding in findings)
 
 
-def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: int) -> Mapping[str, BoardLimits]:
-    """Return the limits of each board by name; `limit` is the largest envelope in bytes."""
+def _boards(table: RouteTable, envelopes: Envelopes, locks: Mapping[str, LockComparison]) -> Mapping[str, BoardLimits]:
+    """Return the limits of each board by name."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
-    if not boards:
-        return {}
+    of_envelope = {
+        name: _limits(table, envelopes.by_name[name], lock)
+        for name, lock in locks.items()
+        if any(envelopes.endpoints[board.name] == name for board in boards)
+    }
+    return {
+        board.name: replace(of_envelope[name], allows_non_finite=board.allow_non_finite)
+        for board in boards
+        if (name := envelopes.endpoints[board.name]) in of_envelope
+    }
+
+
+def _limits(table: RouteTable, envelope: Envelope, lock: LockComparison) -> BoardLimits:
+    """Return the limits of boards that get this envelope and allow finite numbers only."""
+    schema = envelope.schema
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
     named = {route.case.value for route in table.routes}
     named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
     cases = [case for name, case in envelope.cases.items() if name in named]
-    payloads = payload_fields(envelope, cases, schema.board_options)
-    return {board.name: BoardLimits(fields, limit, board.allow_non_finite, payloads) for board in boards}
+    longest, payloads = lock.max_size or envelope.max_size, payload_fields(envelope, cases, schema.board_options)
+    return BoardLimits(fields, longest, allows_non_finite=False, payloads=payloads)
 
 
 def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Iterator[Diagnostic]:
@@ -170,18 +190,20 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
 
     It makes them from messages from ROS and for deadmen; forwarded ones keep their fields.
     """
-    table, schema, envelope = lookup.table, lookup.schema, lookup.envelope
+    table = lookup.table
     for name in dict.fromkeys(name for checked in routes for name in _made_for(checked)):
         endpoint = table.endpoints.get(name)
-        if table.envelope is None or endpoint is None or (endpoint.beside and name not in lookup.beside):
+        if not table.envelopes or endpoint is None or (endpoint.beside and name not in lookup.beside):
             continue  # or `set` has findings already
+        envelope, settings = lookup.envelopes.to(name), table.envelopes[lookup.envelopes.endpoints[name]]
         empty = unfilled(envelope.beside, lookup.beside.get(name))
         for required in (member.name for member in empty if member.is_required):
             message = f"nothing fills '{required}', which {envelope.name} requires, in envelopes for '{name}'"
-            hint = f"see {schema.span(envelope.name, required)}; write `set: {{{required}: VALUE}}` in the endpoint"
+            declared = envelope.schema.span(envelope.name, required)
+            hint = f"see {declared}; write `set: {{{required}: VALUE}}` in the endpoint"
             yield Diagnostic(endpoint.span, Code.MISSING_KEY, message, hint)
         names = [member.name for member in empty if not member.is_required]
-        if endpoint.kind is EndpointKind.BOARD and names and table.envelope.because is None:
+        if endpoint.kind is EndpointKind.BOARD and names and settings.because is None:
             made = f"envelopes for '{name}' from ROS or deadman timers"
             what = f"nothing fills {', '.join(names)} of {envelope.name} in {made}"
             more = ", ..." * (len(names) > 1)
@@ -195,9 +217,10 @@ def _made_for(checked: CheckedRoute) -> Iterator[str]:
     yield from (name for name, _ in (checked.deadman.datagrams if checked.deadman else ()))
 
 
-def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:
-    """Return the protos of the table and its envelope. Raises TableError."""
-    if table.envelope is None:
-        return without_protos()
-    schema = definitions.protos(table.envelope)
-    return schema, chosen_envelope(schema, table.envelope.choice)
+def _envelopes(table: RouteTable, definitions: Definitions) -> Envelopes:
+    """Return the envelopes of the table. Raises TableError."""
+    chosen = {
+        name: chosen_envelope(definitions.protos(settings), settings.choice)
+        for name, settings in table.envelopes.items()
+    }
+    return Envelopes(chosen or {"": no_envelope()}, *table.envelope_names)

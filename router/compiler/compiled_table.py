@@ -17,7 +17,8 @@ from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, Inbound
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
+from router.types.protobuf import PayloadCase
+from router.types.table_envelopes import Envelopes
 
 if TYPE_CHECKING:
     from router.compiler.checked import Target
@@ -248,22 +249,21 @@ class RoutePlan:
 class CompiledTable:
     """A compiled table. `senders` are all endpoints that are sent to, `lowered` has the routines of the carrier.
 
-    `inbound` has the routes by envelope field number; several routes of a case differ in their sources. `outbound` has
-    the routes by topic. `ignored` has the numbers of ignored members of the envelope's oneof, `boards` the limits of
-    each board by name. `named` is the table with the host names that this one has replaced by addresses, or None.
+    `inbound` has the routes by payload case; several routes of a case differ in their sources. `outbound` has the
+    routes by topic. `ignored` has the ignored cases, also of types that no route can take, `boards` the limits of each
+    board by name. `named` is the table with the host names that this one has replaced by addresses, or None.
     """
 
     table: RouteTable
-    envelope: Envelope
+    envelopes: Envelopes
     counters: Counters
     senders: tuple[Endpoint, ...]
     publishers: tuple[TopicPlan, ...]
     subscriptions: tuple[TopicPlan, ...]
-    inbound: Mapping[int, tuple[RoutePlan, ...]]
+    inbound: Mapping[str, tuple[RoutePlan, ...]]
     outbound: Mapping[str, tuple[RoutePlan, ...]]
     deadmen: tuple[DeadmanPlan, ...]
-    ignored: frozenset[int]
-    protos: ProtoSchema
+    ignored: frozenset[str]
     lowered: Lowered
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
@@ -297,4 +297,4 @@ class CompiledTable:
 
     @property
     def protos_sha256(self) -> str:
-        return self.protos.sha256
+        return self.envelopes.sha256

@@ -191,8 +191,9 @@ def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, datagram: by
 
     The size was checked with the payload case.
     """
-    envelope = lookup.envelope.message_class.FromString(datagram)
-    payloads = lookup.envelope.payloads_of(envelope)
+    around = lookup.envelopes.of(payload.case.value)
+    envelope = around.message_class.FromString(datagram)
+    payloads = around.payloads_of(envelope)
     for name in (to.value for to in deadman.to if to.value in lookup.boards):
         board = lookup.boards[name]
         held = [(message, board.payload(case)) for case, message in payloads if case.number in board.payloads]

@@ -60,9 +60,9 @@ def successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...
     for name in deadman.disarmed_by or ():
         if name.value in broken or any(name.value.startswith(f"{case}_from_") for case in broken):
             continue
-        if name.value not in lookup.envelope.cases and name.value not in lookup.routes:
-            message = f"'{name.value}' is neither a payload case of {lookup.envelope.name} nor a route"
-            hint = did_you_mean(name.value, _commanding(lookup, route, deadman) or lookup.envelope.cases)
+        if name.value not in lookup.envelopes.cases and name.value not in lookup.routes:
+            message = f"'{name.value}' is neither a payload case of {lookup.envelopes.first.name} nor a route"
+            hint = did_you_mean(name.value, _commanding(lookup, route, deadman) or lookup.envelopes.cases)
             lookup.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
         elif name.value not in served and are_known:
             to = " or ".join(f"'{to.value}'" for to in deadman.to)
@@ -151,7 +151,7 @@ def _difference(lookup: Lookup, route: Route, other: Route, board: str) -> str |
 
 def _constants(lookup: Lookup, route: Route, board: str) -> Iterator[tuple[str, bytes]]:
     """Yield the fields that are constants in the route's commands to a board, each with its encoding."""
-    case = lookup.envelope.cases.get(route.case.value)
+    case = lookup.envelopes.cases.get(route.case.value)
     if case is None:
         return
     scope = replace(lookup.scope(_NOTHING, None), given=())

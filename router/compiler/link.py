@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     """Make the program of a table, which counts in `counters`; None if the table has errors."""
-    table, schema, envelope, lowered = checked.table, checked.schema, checked.envelope, checked.lowered
-    if table is None or schema is None or envelope is None or lowered is None:
+    table, envelopes, lowered = checked.table, checked.envelopes, checked.lowered
+    if table is None or envelopes is None or lowered is None:
         return None
     served = [route for route in checked.routes if not route.route.ignore]
-    inbound: dict[int, tuple[RoutePlan, ...]] = {}
+    inbound: dict[str, tuple[RoutePlan, ...]] = {}
     outbound: dict[str, tuple[RoutePlan, ...]] = {}
     for route in served:
         if not route.route.is_outbound:
-            number = route.case.number
-            inbound[number] = (*inbound.get(number, ()), _route_plan(route, lowered, _sources(route.route, table)))
+            name = route.case.name
+            inbound[name] = (*inbound.get(name, ()), _route_plan(route, lowered, _sources(route.route, table)))
         for feed in route.subscriptions:
             topic = feed.topic.topic.value
             outbound[topic] = (*outbound.get(topic, ()), _route_plan(route, lowered, frozenset(), feed))
@@ -50,7 +50,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     program = CompiledTable(
         table=table,
-        envelope=envelope,
+        envelopes=envelopes,
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
         publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
@@ -58,8 +58,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
-        ignored=frozenset(envelope.numbers[route.case.value] for route in table.routes if route.ignore),
-        protos=schema,
+        ignored=frozenset(route.case.value for route in table.routes if route.ignore),
         lowered=lowered,
         boards=checked.boards,
         gateways=tuple(checked.gateways),
@@ -72,7 +71,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
 def _state(
     state: CheckedState,
     lowered: Lowered,
-    inbound: Mapping[int, Iterable[RoutePlan]],
+    inbound: Mapping[str, Iterable[RoutePlan]],
     served: Iterable[CheckedRoute],
 ) -> StatePlan:
     declared = state.declared
@@ -80,7 +79,7 @@ def _state(
         taken = {state.label: {state.feed.topic.topic.value}}
     else:
         names = {source.value for source in declared.sources}
-        plans = inbound.get(state.case.number, ()) if state.case is not None else ()
+        plans = inbound.get(state.case.name, ()) if state.case is not None else ()
         taken = {plan.route: names & plan.sources for plan in plans}
     return StatePlan(
         declared.name,

@@ -19,7 +19,7 @@ from router.compiler.expressions.tree import Node
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, one_of
 from router.table.model import RouteTable
-from router.table.model.endpoints import Endpoint, EndpointKind
+from router.table.model.endpoints import Endpoint
 from router.table.model.expressions import Expression
 from router.table.model.routes import ANY, ROS, Route
 from router.table.model.settings import EnvelopeSettings
@@ -27,8 +27,9 @@ from router.table.model.targets import Topic
 from router.types.board_limits import BoardLimits
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
-from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, load_protos, lock_path
+from router.types.protobuf import PayloadCase, ProtoSchema, load_protos, lock_path
 from router.types.ros import RosInterfaces, definition, ros_interfaces
+from router.types.table_envelopes import Envelopes
 
 
 class Definitions:
@@ -37,9 +38,9 @@ class Definitions:
     `known` are protos that were read before; they are reused if their files are unchanged.
     """
 
-    def __init__(self, known: ProtoSchema | None = None) -> None:
+    def __init__(self, known: Iterable[ProtoSchema] = ()) -> None:
         self._protos: dict[tuple[Path, str, Path, tuple[str, ...], bool], ProtoSchema] = {}
-        self._known = known
+        self._known = tuple(known)
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Return the protos of an envelope. Raises TableError; an invalid folder is read again for each table."""
@@ -54,15 +55,14 @@ class Definitions:
         return self._protos[key]
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
-        known = self._known
         root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock)
         exclude = [entry.value for entry in settings.exclude]
         wanted = root, lock, exclude, settings.has_many
-        if known is None or (known.root, known.lock, known.exclude, known.with_others) != wanted:
-            return None
-        if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
-            return None
-        return known if known.inputs.read_again() else None
+        for known in self._known:
+            is_same = (known.root, known.lock, known.exclude, known.with_others) == wanted
+            if is_same and settings.message.value in (known.envelope, known.envelope.rpartition(".")[2]):
+                return known if known.inputs.read_again() else None
+        return None
 
     @cached_property
     def interfaces(self) -> RosInterfaces:
@@ -78,15 +78,13 @@ NO_NAMES: Mapping[str, Node] = {}
 class Lookup:
     """Looks up the names of one table and collects findings.
 
-    `board_limit` is as in `board_findings`; `boards` has the limits of each board by endpoint, `beside` what `set` of
-    an endpoint fills, `states` the kind of each state, None for one with a finding.
+    `boards` has the limits of each board by endpoint, `beside` what `set` of an endpoint fills, `states` the kind of
+    each state, None for one with a finding.
     """
 
     table: RouteTable
-    schema: ProtoSchema
-    envelope: Envelope
+    envelopes: Envelopes
     definitions: Definitions
-    board_limit: int
     boards: Mapping[str, BoardLimits]
     findings: list[Diagnostic] = field(default_factory=list)
     beside: Mapping[str, Beside] = field(default_factory=dict)
@@ -109,14 +107,13 @@ class Lookup:
         return {route.name: route for route in self.table.routes}
 
     def case(self, name: Located[str]) -> PayloadCase | None:
-        case = self.envelope.cases.get(name.value)
-        if (other := self.envelope.unroutable.get(name.value)) is not None:
+        case = self.envelopes.cases.get(name.value)
+        if (other := self.envelopes.unroutable.get(name.value)) is not None:
             message = f"no route can take '{name.value}': it is {other.type}, not a message"
             hint = "wrap it in a message of its own, or ignore it with `ignore: reason`"
             self.report(name.span, Code.BAD_PROTO, message, hint)
         elif case is None:
-            message = f"{self.envelope.name} has no payload case '{name.value}'"
-            hint = did_you_mean(name.value, self.envelope.cases)
+            message, hint = self.envelopes.unknown_case(name.value)
             self.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
         return case
 
@@ -140,8 +137,8 @@ class Lookup:
         finding = loop_finding(self.table, endpoint, name.span, case.name, sources)
         if finding and finding.message not in {earlier.message for earlier in self.findings}:
             self.findings.append(finding)  # an endpoint that is the router itself is reported once, not per route
-        if endpoint.kind is EndpointKind.BOARD:
-            self.findings += board_findings(case, self.schema, self.board_limit, name.span)
+        if (limits := self.boards.get(endpoint.name)) is not None:
+            self.findings += board_findings(case, self.envelopes.of(case.name).schema, limits.longest, name.span)
         return endpoint
 
     def ros_type(self, topic: Topic) -> MessageType | None:
@@ -187,7 +184,7 @@ class Lookup:
     ) -> Scope:
         """Return the scope of expressions over `message`, with the constants of `ros_type` and of the types in it."""
         nested = tuple(nested_types(ros_type)) if ros_type else ()
-        return Scope(message, tuple(self.schema.enums.values()), nested, names, states=self.states)
+        return Scope(message, self.envelopes.enums, nested, names, states=self.states)
 
     def received(
         self,
@@ -199,7 +196,7 @@ class Lookup:
         """Return the scope of expressions over a payload from UDP and its envelope. A `route` names its sources."""
         sources = tuple(source.value for source in route.sources) if route else ()
         known = () if ANY in sources else sources
-        return replace(self.scope(case.type, ros_type, names), envelope=self.envelope, sources=known)
+        return replace(self.scope(case.type, ros_type, names), envelope=self.envelopes.of(case.name), sources=known)
 
     def value(
         self,

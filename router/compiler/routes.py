@@ -38,12 +38,12 @@ def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
 
 
 def _coverage(lookup: Lookup) -> None:
-    table, cases, unroutable = lookup.table, lookup.envelope.cases, lookup.envelope.unroutable
+    table, cases, unroutable = lookup.table, lookup.envelopes.cases, lookup.envelopes.unroutable
     names = [route.case.value for route in table.routes]
     # a misspelt case is one finding, not two
     covered = {name if name in cases else nearest(name, cases) for name in names if name not in unroutable}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-    missing = [name for name in cases if name not in covered and name not in lookup.envelope.parts]
+    missing = [name for name in cases if name not in covered and name not in lookup.envelopes.parts]
     if missing and table.routes_span is not None:  # a table with only gateways has no routes
         plural = "payload case" if len(missing) == 1 else "payload cases"
         message = f"no route for the {plural} {', '.join(missing)}"
@@ -88,7 +88,7 @@ _MOST_LISTS = 4
 
 
 def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
-    if route.ignore is not None and route.case.value in lookup.envelope.unroutable:
+    if route.ignore is not None and route.case.value in lookup.envelopes.unroutable:
         return None
     case = lookup.case(route.case)
     if case is None:

@@ -33,13 +33,13 @@ from router.compiler.metrics import (
 from router.compiler.resolution import unresolved
 from router.table.model import RouteTable
 from router.table.model.routes import ROS
-from router.types.protobuf import Envelope
+from router.types.table_envelopes import Envelopes
 
 
 def open_series(program: CompiledTable) -> None:
     """Open the series of a program in its counters."""
     counters, table = program.counters, program.table
-    _open_listeners(counters, table, program.envelope)
+    _open_listeners(counters, table, program.envelopes)
     _open_own(counters, table)
     for plan in program.routes:
         _open_route(counters, table, plan)
@@ -62,7 +62,7 @@ def _open_each(counters: Counters, metric: str, *labels: str, last: Iterable[str
         counters.index(metric, *labels, value)
 
 
-def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -> None:
+def _open_listeners(counters: Counters, table: RouteTable, envelopes: Envelopes) -> None:
     for listener in table.listeners:
         _open(
             counters,
@@ -79,7 +79,7 @@ def _open_listeners(counters: Counters, table: RouteTable, envelope: Envelope) -
         if table.listeners[listener].groups:
             _open(counters, ("groups_not_joined",), listener)
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
-    _open_each(counters, "unhandled", last=(*envelope.numbers, UNKNOWN_CASE))
+    _open_each(counters, "unhandled", last=(*envelopes.numbers, UNKNOWN_CASE))
     for metric in ENDPOINT_METRICS:
         _open_each(counters, metric, last=table.endpoints)
     _open_each(counters, "endpoint_unresolved", last=unresolved(table))

@@ -30,15 +30,15 @@ _BY_TYPE: Mapping[int, WireKind] = {
 _BY_WIRE_TYPE: Mapping[int, WireKind] = {VARINT: WireKind.VARINT, I64: WireKind.I64, I32: WireKind.I32}
 
 
-def write_schema(envelope: Envelope, routed: Container[int], arrays: Arrays) -> c.WireSchema:
-    """Write the types of an envelope and its payloads. `routed` are the numbers of the cases with a route."""
+def write_schema(envelope: Envelope, routed: Container[str], arrays: Arrays) -> c.WireSchema:
+    """Write the types of an envelope and its payloads. `routed` are the cases with a route."""
     choice, roots = envelope.choice, [_descriptor(envelope.message_class)]
     flags: dict[int, int] = {}
     held: list[PayloadCase] = []
     if isinstance(choice, (ByOneof, ByCases)):
-        flags = {number: _case_flags(number, routed) for number in envelope.numbers.values()}
+        flags = {number: _case_flags(name, routed) for name, number in envelope.numbers.items()}
     elif isinstance(choice, ByName):
-        held = [case for case in envelope.cases.values() if case.number in routed]
+        held = [case for case in envelope.cases.values() if case.name in routed]
         roots += [_descriptor(case.message_class) for case in held]
     indexes = all_types(*roots)
     types = []
@@ -66,8 +66,8 @@ def _name(text: str, index: int, arrays: Arrays) -> c.WireName:
     return c.WireName(text=arrays.text(data), size=len(data), type=index)
 
 
-def _case_flags(number: int, routed: Container[int]) -> int:
-    return WireFlag.CASE | WireFlag.ROUTED if number in routed else WireFlag.CASE
+def _case_flags(name: str, routed: Container[str]) -> int:
+    return WireFlag.CASE | WireFlag.ROUTED if name in routed else WireFlag.CASE
 
 
 def _lowered(descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, int]) -> list[c.WireField]:

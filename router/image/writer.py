@@ -25,6 +25,7 @@ from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
 from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing, Listener
+from router.types.protobuf import Envelope
 
 
 def write_image(program: CompiledTable, names: Names | None = None) -> Image:
@@ -114,45 +115,45 @@ class _Writer:
         return self.targets.arrays
 
     def program_of(self, plans: list[RoutePlan]) -> c.Program:
-        protocol = ctypes.pointer(self._protocol())
+        protocols = {
+            name: ctypes.pointer(self._protocol(each)) for name, each in self.program.envelopes.by_name.items()
+        }
+        listeners = [self._listener(each, protocols) for each in self.program.listeners]
         return c.Program(
-            listener_count=len(self.program.listeners),
+            listener_count=len(listeners),
             state_count=len(self.program.states),
             states=self.targets.states,
-            listeners=self.arrays.array(
-                c.Listener, [self._listener(plan, protocol) for plan in self.program.listeners]
-            ),
+            listeners=self.arrays.array(c.Listener, listeners),
             routes=self.arrays.array(c.Route, [self._route(plan) for plan in plans]),
         )
 
-    def _protocol(self) -> c.Protocol:
-        program = self.program
+    def _protocol(self, envelope: Envelope) -> c.Protocol:
         return self.arrays.add(
             c.Protocol(
-                schema=write_schema(program.envelope, program.inbound.keys(), self.arrays),
-                cases=self.arrays.array(c.PayloadCase, self._cases()),
-                case_count=len(program.envelope.numbers),
+                schema=write_schema(envelope, self.program.inbound, self.arrays),
+                cases=self.arrays.array(c.PayloadCase, self._cases(envelope)),
+                case_count=len(envelope.numbers),
                 unknown_case=self.counters.index("unhandled", UNKNOWN_CASE),
             )
         )
 
     # senders and payload cases
 
-    def _cases(self) -> list[c.PayloadCase]:
-        members = sorted((number, name) for name, number in self.program.envelope.numbers.items())
-        rows = {number: row for row, number in enumerate(self.program.inbound)}
+    def _cases(self, envelope: Envelope) -> list[c.PayloadCase]:
+        members = sorted((number, name) for name, number in envelope.numbers.items())
+        rows = {name: row for row, name in enumerate(self.program.inbound)}
         return [
             c.PayloadCase(
                 number=number,
-                row=rows.get(number, -1),
-                is_ignored=number in self.program.ignored,
+                row=rows.get(name, -1),
+                is_ignored=name in self.program.ignored,
                 unhandled=self.counters.index("unhandled", name),
             )
             for number, name in members
         ]
 
-    def _listener(self, plan: Listener, protocol: ctypes._Pointer[c.Protocol]) -> c.Listener:
-        """Write a listener, without its socket."""
+    def _listener(self, plan: Listener, protocols: Mapping[str, ctypes._Pointer[c.Protocol]]) -> c.Listener:
+        """Write a listener, without its socket. `protocols` are by the name of the envelope."""
         counters, name = self.counters, plan.name
         peers, learned = list(self._peers(name)), list(self._learned(name))
         return c.Listener(
@@ -160,7 +161,7 @@ class _Writer:
             id=self.targets.openings.names.number(name),
             repairs=plan.framing is Framing.ZERO_TRIMMED,
             link=self.targets.openings.link(plan) if plan.line is not None else None,
-            protocol=protocol,
+            protocol=protocols[self.program.envelopes.listeners[name]],
             peers=self.arrays.array(c.Peer, peers),
             learned=self.arrays.array(c.LearnedPeer, learned),
             choices=self.arrays.array(c.Choice, list(self._choices())),

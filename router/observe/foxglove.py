@@ -75,11 +75,11 @@ def _key(case: PayloadCase) -> _ChannelKey:
 
 
 class _View(NamedTuple):
-    """A program, and the numbers of its channels by the field number of the payload case."""
+    """A program, and the numbers of its channels by payload case."""
 
     program: CompiledTable
     classifier: Classifier
-    channels: Mapping[int, int]
+    channels: Mapping[str, int]
 
 
 class _Message(NamedTuple):
@@ -290,7 +290,7 @@ class FoxgloveServer:
             return
         before = dict(self._numbers)
         self._view = self._view_of(program)
-        current = set(map(_key, program.envelope.cases.values()))
+        current = set(map(_key, program.envelopes.cases.values()))
         gone = [self._numbers.pop(key) for key in before.keys() - current]
         added = [_advertised(number, key) for key, number in self._numbers.items() if key not in before]
         for client in self._clients.values():
@@ -302,24 +302,24 @@ class FoxgloveServer:
 
     def _view_of(self, program: CompiledTable) -> _View:
         channels = {}
-        for case in program.envelope.cases.values():
+        for case in program.envelopes.cases.values():
             key = _key(case)
             if key not in self._numbers:
                 self._numbers[key] = self._next_number
                 self._next_number += 1
-            channels[case.number] = self._numbers[key]
-        return _View(program, Classifier(program.envelope, program.table), channels)
+            channels[case.name] = self._numbers[key]
+        return _View(program, Classifier(program.envelopes, program.table), channels)
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
         """Send the accepted payloads of subscribed channels. Called by the mirror."""
         program, classifier, channels = self._view
-        numbers_in = program.envelope.choice.numbers_in
+        envelopes = program.envelopes
         messages = []
         for at, listener, _, _, reason, data in batch:
-            if reason or self._wanted.isdisjoint(map(channels.get, numbers_in(data, channels))):
+            if reason or self._wanted.isdisjoint(map(channels.get, envelopes.at(listener).cases_in(data))):
                 continue
             for case, payload in classifier.encoded_payloads(listener, data):
-                messages.append(_Message(channels[case.number], at, payload))
+                messages.append(_Message(channels[case.name], at, payload))
         self._arrived.extend(messages)
         if messages and not self._is_showing:
             self._is_showing = True

@@ -32,8 +32,8 @@ class LastValues:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._newest: dict[int, tuple[int, Mirrored]] = {}
-        """By the number of the payload case, with the time of arrival here (boot clock, ns)."""
+        self._newest: dict[str, tuple[int, Mirrored]] = {}
+        """By the payload case, with the time of arrival here (boot clock, ns)."""
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
@@ -55,7 +55,7 @@ class LastValues:
                     raise
             with self._newest_lock:
                 newest, self._newest = self._newest, {}
-            classifier = Classifier(program.envelope, program.table)
+            classifier = Classifier(program.envelopes, program.table)
             for at, datagram in sorted(newest.values(), key=itemgetter(0)):  # a datagram may have several values
                 self._decode(at, datagram, classifier)
             return dict(self._values)
@@ -67,14 +67,13 @@ class LastValues:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Remember the newest datagrams. Called by the mirror."""
-        now, envelope = boottime_ns(), self._running.program.envelope
-        numbers = frozenset(envelope.numbers.values())
+        now, envelopes = boottime_ns(), self._running.program.envelopes
         with self._newest_lock:
             for datagram in batch:
-                *_, reason, data = datagram
+                _, listener, *_, reason, data = datagram
                 if not reason:
-                    for number in envelope.choice.numbers_in(data, numbers) or (0,):
-                        self._newest[number] = now, datagram
+                    for case in envelopes.at(listener).cases_in(data) or ("",):
+                        self._newest[case] = now, datagram
 
     def _decode(self, at: int, datagram: Mirrored, classifier: Classifier) -> None:
         _, listener, peer, endpoint, _, data = datagram

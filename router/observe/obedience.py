@@ -85,9 +85,10 @@ def why_disobeyed(program: CompiledTable, route: str, board: str, replies: Repli
 def _read_fields(evidence: Evidence, program: CompiledTable) -> str:
     """Return the fields that the condition of `obeyed` reads in a datagram, on one line."""
     try:
-        decoded = Wire(program.envelope).decode(evidence.data)
+        (obeyed,) = (each.obeyed for each in program.deadmen if each.route == evidence.route and each.obeyed)
+        decoded = Wire(program.envelopes).decode(evidence.data, program.envelopes.of(obeyed.case.name))
         names = program.lowered.obeyed[evidence.route].layout.names
-    except (DecodeError, KeyError):  # a reload has changed the messages or the deadmen meanwhile
+    except (DecodeError, KeyError, ValueError):  # a reload has changed the messages or the deadmen meanwhile
         return ""
     tree = protobuf_tree(decoded.message, decoded.case.type, _DIGITS)
     read = [word for word in words(tree) if word.partition("=")[0] in names]

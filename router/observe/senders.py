@@ -75,8 +75,8 @@ class Senders:
         return few([*sentences]), routes
 
     def unknown(self, listener: str) -> str:
-        """Describe who sends payloads to a listener that the envelope does not have."""
-        known = self._program.envelope.numbers
+        """Describe who sends payloads to a listener that its envelope does not have."""
+        known = self._program.envelopes.numbers
         found = [each for each in self._mismatches if each.listener == listener and each.payload_case not in known]
         return few([f"{self._name_of(each.host)} sends {each.payload_case}" for each in found])
 

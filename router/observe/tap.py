@@ -83,15 +83,15 @@ def _of_decision(decisions: Sequence[str]) -> Wanted:
 
 
 def _of_case(program: CompiledTable, cases: Sequence[str]) -> Wanted:
-    known = program.envelope.cases
+    known = program.envelopes.cases
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
-    numbers_in, numbers = program.envelope.choice.numbers_in, frozenset(program.envelope.numbers.values())
-    unwanted = numbers - {known[name].number for name in cases}
+    envelopes = program.envelopes
+    unwanted = envelopes.numbers.keys() - cases
 
     def is_wanted(datagram: Mirrored) -> bool:
-        *_, data = datagram
-        found = numbers_in(data, numbers)
+        _, listener, *_, data = datagram
+        found = envelopes.at(listener).cases_in(data)
         return not found or not unwanted.issuperset(found)
 
     return is_wanted

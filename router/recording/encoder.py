@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError as ProtobufError
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
 from router.recording.channels import Channels, Datagram, Event
-from router.recording.mirror import Acted, Action, Classifier, Mirrored, Taken
+from router.recording.mirror import Acted, Action, Classifier, Format, Mirrored, Taken
 from router.types.protobuf import PayloadCase
 from router.types.wire import varint
 
@@ -165,7 +165,7 @@ class Encoder:
             self._shapes.clear()
         listener, peer, endpoint, reason, length, _ = key
         shape = _Shape(None, b"", bytes)
-        if length <= MAX_DATAGRAM and (found := _only_payload(classifier, data, length)) is not None:
+        if length <= MAX_DATAGRAM and (found := _only_payload(classifier.at(listener), data, length)) is not None:
             case, header = found
             channel = self._channels.payload(case, listener, peer, endpoint, reason)
             shape = _Shape(channel, header, case.message_class.FromString)
@@ -184,19 +184,19 @@ class Encoder:
     def _action(self, classifier: Classifier, action: Action) -> tuple[int, bytes]:
         """Return channel and message: the payload that was sent, or else an Event."""
         _, what, route, target, topic, reason, detail, data = action
-        if data and not reason and (sent := classifier.sent_payload(data)) is not None:
+        if data and not reason and (sent := classifier.sent_payload(target, data)) is not None:
             case, payload = sent
             return self._channels.sent(case, what, route, target, topic), payload
         event = Event(what=what, route=route, endpoint=target, ros=topic, reason=reason, detail=detail, data=data)
         return self._channels.events(), event.SerializeToString()
 
 
-def _only_payload(classifier: Classifier, data: bytes, length: int) -> tuple[PayloadCase, bytes] | None:
+def _only_payload(of: Format, data: bytes, length: int) -> tuple[PayloadCase, bytes] | None:
     """Return the payload case of a datagram that has only a payload, and what precedes it; else None."""
-    if classifier.frame_case is not None:
-        return classifier.frame_case, b""
+    if of.frame_case is not None:
+        return of.frame_case, b""
     tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
-    case, header = classifier.cases_by_tag.get(tag), _header(tag, length)
+    case, header = of.cases_by_tag.get(tag), _header(tag, length)
     return (case, header) if case is not None and header is not None else None
 
 

@@ -22,6 +22,7 @@ from router.table.model.endpoints import Framing
 from router.threads import Thread, WakeEvent, join_or_abandon
 from router.types.framing import restored
 from router.types.protobuf import Envelope, PayloadCase
+from router.types.table_envelopes import Envelopes
 from router.types.wire import varint
 
 PERIOD = 50_000_000
@@ -262,48 +263,17 @@ class _Delivery:
             self._mirror.deliver()
 
 
-class Classifier:
-    """Finds payload and sender of a datagram as routing does. Any thread may use it."""
+class Format:
+    """An envelope, and its payload cases by the bytes before the payload."""
 
-    def __init__(self, envelope: Envelope, table: RouteTable) -> None:
+    def __init__(self, envelope: Envelope) -> None:
         self.envelope = envelope
-        self._trimming = frozenset(
-            listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
-        )
         alone = [case for case in envelope.cases.values() if case.wrapping.is_alone]
         self.cases_by_tag = {varint(case.wrapping.tag): case for case in alone}
         self.frame_case = next((case for case in envelope.cases.values() if not case.wrapping.tag), None)
         """The case of an envelope that is itself the payload."""
-        self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
 
-    def payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, Message]]:
-        """Return the payloads with their cases; none for a datagram that the listener rejects."""
-        if len(data) > MAX_DATAGRAM or not self.envelope.cases:
-            return []
-        if listener in self._trimming:
-            data = restored(data)
-        try:
-            return self.envelope.payloads_of(self.envelope.message_class.FromString(data))
-        except ProtobufError:
-            return []
-
-    def encoded_payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, bytes]]:
-        """Like `payloads`, but return their bytes; much faster for a frame with zeros removed or added."""
-        if listener in self._trimming and (field := self._single_field(data)) is not None:
-            return [field]
-        return [(case, payload.SerializePartialToString()) for case, payload in self.payloads(listener, data)]
-
-    def sent_payload(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
-        """Return payload case and payload of a datagram that the router has sent, perhaps without trailing zeros."""
-        if (field := self._single_field(data)) is not None:
-            return field
-        try:
-            payloads = self.envelope.payloads_of(self.envelope.message_class.FromString(restored(data)))
-        except ProtobufError:
-            return None
-        return next(((case, payload.SerializePartialToString()) for case, payload in payloads), None)
-
-    def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
+    def single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return payload case and payload; None if more than zeros follow the first field, or its length takes over two
         bytes.
         """
@@ -326,6 +296,51 @@ class Classifier:
         except ProtobufError:
             return None
         return case, payload
+
+
+class Classifier:
+    """Finds payload and sender of a datagram as routing does. Any thread may use it."""
+
+    def __init__(self, envelopes: Envelopes, table: RouteTable) -> None:
+        self._envelopes = envelopes
+        self._formats = {envelope: Format(envelope) for envelope in envelopes.by_name.values()}
+        self._trimming = frozenset(
+            listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
+        )
+        self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
+
+    def at(self, listener: str) -> Format:
+        """Return the format of what a listener receives."""
+        return self._formats[self._envelopes.at(listener)]
+
+    def payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, Message]]:
+        """Return the payloads with their cases; none for a datagram that the listener rejects."""
+        envelope = self._envelopes.at(listener)
+        if len(data) > MAX_DATAGRAM or not envelope.cases:
+            return []
+        if listener in self._trimming:
+            data = restored(data)
+        try:
+            return envelope.payloads_of(envelope.message_class.FromString(data))
+        except ProtobufError:
+            return []
+
+    def encoded_payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, bytes]]:
+        """Like `payloads`, but return their bytes; much faster for a frame with zeros removed or added."""
+        if listener in self._trimming and (field := self.at(listener).single_field(data)) is not None:
+            return [field]
+        return [(case, payload.SerializePartialToString()) for case, payload in self.payloads(listener, data)]
+
+    def sent_payload(self, endpoint: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
+        """Return case and payload of a datagram that the router has sent there, perhaps without trailing zeros."""
+        envelope = self._envelopes.to(endpoint)
+        if (field := self._formats[envelope].single_field(data)) is not None:
+            return field
+        try:
+            payloads = envelope.payloads_of(envelope.message_class.FromString(restored(data)))
+        except ProtobufError:
+            return None
+        return next(((case, payload.SerializePartialToString()) for case, payload in payloads), None)
 
     def sender(self, listener: str, peer: Peer) -> str:
         """Return the sender's name in the table; "" for a stranger."""

@@ -107,7 +107,7 @@ class Recorder:
         self._running_program = program
         self._settings = settings
         self._program = program()
-        self._classifier = Classifier(self._program.envelope, self._program.table)
+        self._classifier = Classifier(self._program.envelopes, self._program.table)
         self._channels = Channels()
         self._packer = Packer()
         self._queue: deque[Batch] = deque()  # for continuous recording
@@ -213,7 +213,7 @@ class Recorder:
             return
         program = self._running_program()
         if program is not self._program:
-            self._program, self._classifier = program, Classifier(program.envelope, program.table)
+            self._program, self._classifier = program, Classifier(program.envelopes, program.table)
         batch = self._packer.pack(datagrams, actions, self._classifier, wall_ns(), boottime_ns())
         with self._taking:
             if self._ring is not None:

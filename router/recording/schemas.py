@@ -12,7 +12,7 @@ from google.protobuf.message_factory import GetMessageClass
 from router.declared import ONLY_CASE
 from router.types.case_by import ByCases, ByFrame, ByName, ByOneof, Choice, Wrapping
 from router.types.nanopb import NO_OPTIONS
-from router.types.protobuf import Envelope, PayloadCase, build_types
+from router.types.protobuf import Envelope, PayloadCase, build_types, no_protos
 from router.types.wire import LEN, read_varint
 
 _FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "payload"
@@ -61,7 +61,7 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
     choice: Choice
     if frame := next((case for case in known.values() if not case.around.tag), None):
         only = made(frame, ONLY_CASE)
-        return Envelope(frame.message, ByFrame(frame.name), only.message_class, {only.name: only}, 0)
+        return Envelope(frame.message, no_protos(), ByFrame(frame.name), only.message_class, {only.name: only}, 0)
     if named:
         numbered = [(made(case, number), *_name_of(case.around)) for number, case in enumerate(named, 1)]
         payload_cases = [case for case, *_ in numbered]
@@ -74,7 +74,8 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
         choice = _add_fields(message, payload_cases, is_shared=any(case.around.is_shared for case in inside))
     pool.AddSerializedFile(own.SerializeToString())
     by_name = {case.name: case for case in payload_cases}
-    return Envelope(_NAME, choice, GetMessageClass(pool.FindMessageTypeByName(_NAME)), by_name, 0)
+    message_class = GetMessageClass(pool.FindMessageTypeByName(_NAME))
+    return Envelope(_NAME, no_protos(), choice, message_class, by_name, 0)
 
 
 def _add_fields(message: DescriptorProto, cases: Sequence[PayloadCase], *, is_shared: bool) -> Choice:

@@ -108,7 +108,7 @@ class Against:
     @property
     def is_among_strangers(self) -> bool:
         """Whether neither table has an endpoint for any sender."""
-        tables = [Classifier(program.envelope, program.table) for program in self._programs]
+        tables = [Classifier(program.envelopes, program.table) for program in self._programs]
         places = {(listener, peer) for _, listener, peer in self.senders}
         return bool(places) and not any(table.sender(*place) for table in tables for place in places)
 
@@ -213,7 +213,7 @@ class Report:
     def __init__(self, old: Checked, new: Checked) -> None:
         self._tables = (old, new)
         self._indexes = (TableIndex(old), TableIndex(new))
-        self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
+        self._wires = tuple(Wire(checked.envelopes) for checked in (old, new) if checked.envelopes)
 
     def lines(self, comparison: Against) -> Iterator[str]:
         """Yield the whole report; a short one if both tables deliver the same."""
@@ -256,7 +256,8 @@ class Report:
         unread = _Content("a message" if isinstance(event, Published) else "a datagram", {"bytes": event.data.hex()})
         if isinstance(event, Sent):
             try:
-                decoded = self._wires[side].decode(event.data)
+                wire = self._wires[side]
+                decoded = wire.decode(event.data, wire.envelopes.to(event.target))
             except DecodeError:
                 return unread
             return _Content(decoded.case.name, dict(leaves(decoded.case.type, decoded.message)))

@@ -61,7 +61,7 @@ class Comparison:
     """Compares the steps of the tests of one table; `describer` describes events."""
 
     def __init__(self, checked: Checked, program: CompiledTable) -> None:
-        self._wire = Wire(program.envelope)
+        self._wire = Wire(program.envelopes)
         self.describer = EventDescriber(checked, program)
         self._index = self.describer.index
         self._table = program.table
@@ -157,8 +157,9 @@ class Comparison:
             yield from self._different_payload(expected, expected.case.name, event, outcome)
 
     def _different_payload(self, expected: Delivery, case: str, event: Sent, outcome: Outcome) -> Iterator[Failure]:
+        around = self._wire.envelopes.to(event.target)
         try:
-            decoded = self._wire.decode(event.data)
+            decoded = self._wire.decode(event.data, around)
         except DecodeError as error:
             yield Failure(
                 expected.span,
@@ -169,7 +170,7 @@ class Comparison:
         if decoded.case.name != case:
             yield Failure(expected.span, f"{self.describer.describe(event)}, not {case}", self.describer.related(event))
             return
-        now, around = outcome.given_at(event.at), self._wire.envelope
+        now = outcome.given_at(event.at)
         if expected.fields is not None:
             for difference in expected.fields.differences((), decoded.case.type, decoded.message, now):
                 yield self._different_field(difference, event)

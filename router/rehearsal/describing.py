@@ -117,7 +117,7 @@ class EventDescriber:
 
     def __init__(self, checked: Checked, program: CompiledTable) -> None:
         self.index = TableIndex(checked)
-        self._wire = Wire(program.envelope)
+        self._wire = Wire(program.envelopes)
 
     def lines(self, events: Iterable[Event]) -> list[str]:
         """Return everything that happened, in order, each with its place in the table."""
@@ -153,7 +153,7 @@ class EventDescriber:
         match event:
             case Sent():
                 by = f" by the deadman of {event.route}" if event.by_deadman else ""
-                return f"{at}{self._datagram(event.data)} is sent to {event.target}{by}"
+                return f"{at}{self._datagram(event)} is sent to {event.target}{by}"
             case Published():
                 kind = self.index.type(event.route, event.target)
                 inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
@@ -174,11 +174,11 @@ class EventDescriber:
                 return at + _of_change(event)
         raise AssertionError(event)
 
-    def _datagram(self, data: bytes) -> str:
+    def _datagram(self, event: Sent) -> str:
         try:
-            decoded = self._wire.decode(data)
+            decoded = self._wire.decode(event.data, self._wire.envelopes.to(event.target))
         except DecodeError:
-            return data.hex(" ")
+            return event.data.hex(" ")
         return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
 
 

@@ -72,7 +72,7 @@ def _run_step(step: Step, rehearsal: Rehearsal, program: CompiledTable) -> Outco
     rehearsal.events.clear()
     begin = rehearsal.now if step.at is None else START + step.at
     rehearsal.advance(begin)
-    given = _give(step.given, rehearsal, Wire(program.envelope)) if step.given else []
+    given = _give(step.given, rehearsal, Wire(program.envelopes)) if step.given else []
     if step.until is not None:
         rehearsal.advance(START + step.until)
     if step.stop:
@@ -107,7 +107,7 @@ def _datagram(given: Given, wire: Wire, now: int) -> bytes:
     try:
         if given.case is not None and given.fields is not None:
             payload = protobuf_message(given.case.message_class, given.fields, now)
-            around = wire.envelope.message_class
+            around = wire.envelopes.of(given.case.name).message_class
             beside = protobuf_message(around, given.beside, now) if given.beside is not None else None
             data = wire.encode(given.case, payload, beside)
         return framed(data, given.trim, given.pad)

@@ -23,7 +23,7 @@ from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
-from router.types.model import Enum, MessageType
+from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 UNCHANGED = "unchanged"
@@ -136,28 +136,29 @@ class Names:
     def constants(self) -> Mapping[str, set[int]]:
         """The numbers of enum values by name, plain and with the name of their enum."""
         numbers: dict[str, set[int]] = {}
-        enums: Iterable[Enum] = self._checked.schema.enums.values() if self._checked.schema else ()
-        for enum in enums:
+        for enum in self._program.envelopes.enums:
             for name, number in enum.values:
                 for known in (name, f"{enum.name.rpartition('.')[2]}.{name}"):
                     numbers.setdefault(known, set()).add(number)
         return numbers
 
     def case(self, name: str, span: SourceSpan) -> PayloadCase:
-        envelope = self._program.envelope
-        if name not in envelope.cases:
-            message = f"{envelope.name} has no payload case '{name}'"
-            raise InvalidValueError(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
-        return envelope.cases[name]
+        envelopes = self._program.envelopes
+        if name not in envelopes.cases:
+            raise InvalidValueError(span, Code.UNKNOWN_PAYLOAD_CASE, *envelopes.unknown_case(name))
+        return envelopes.cases[name]
 
     @property
     def cases(self) -> Collection[str]:
-        return self._program.envelope.cases
+        return self._program.envelopes.cases
 
-    @property
-    def beside(self) -> MessageType:
-        """The fields of the envelope beside the payload."""
-        return self._program.envelope.beside
+    def beside(self, case: PayloadCase) -> MessageType:
+        """The fields of the envelope of a payload case beside the payload."""
+        return self._program.envelopes.of(case.name).beside
+
+    def beside_to(self, endpoint: str) -> MessageType:
+        """The fields beside the payload of the envelope that an endpoint gets."""
+        return self._program.envelopes.to(endpoint).beside
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
         """Return the address that an endpoint sends from, or an address written HOST:PORT."""
@@ -279,7 +280,7 @@ class GivenReader:
             listener=self._names.listener(optional_text(node, "listener"), sender.value, span),
             case=case,
             fields=self._content(case.type, node.get("fields"), span) if case else None,
-            beside=self._content(self._names.beside, node.get("envelope"), span) if case else None,
+            beside=self._content(self._names.beside(case), node.get("envelope"), span) if case else None,
             data=data,
             trim=boolean(node, "trim"),
             pad=pad.value if pad else 0,
@@ -370,19 +371,19 @@ class ExpectedReader:
             return {self._names.endpoint(name, span): (_unchanged(span, given),) for name, span in named}
         return {
             self._names.endpoint(name, entry.key.span): tuple(
-                delivery for one in _listed(entry.value) for delivery in self._datagrams(one, given)
+                delivery for one in _listed(entry.value) for delivery in self._datagrams(name, one, given)
             )
             for name, entry in node.entries.items()
         }
 
-    def _datagrams(self, node: Node, given: Node | None) -> Sequence[Delivery]:
+    def _datagrams(self, endpoint: str, node: Node, given: Node | None) -> Sequence[Delivery]:
         if isinstance(node, ScalarNode):
             return [_of_word(node, given)]
         if not isinstance(node, MappingNode):
             raise InvalidValueError(node.span, Code.WRONG_TYPE, "a list within a list is not a datagram")
         times, around = _times(node), self._around(node)
         content = [(name, entry) for name, entry in node.entries.items() if name != "times" and entry is not around]
-        beside = self._fields.message(self._names.beside, around.value) if around else None
+        beside = self._fields.message(self._names.beside_to(endpoint), around.value) if around else None
         if not content and around is None:
             return [_unchanged(node.span, given)] * times
         if around is not None and (not content or "hex" in node.entries):

@@ -110,7 +110,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         path=sources[0].path,
         files=tuple(source.path for source in sources),
         sha256=sha256(b"".join(source.data for source in sources)).hexdigest(),
-        envelope=envelope,
+        envelopes={"": envelope} if envelope else {},
         node=builder.one(root, "node", _node) or NodeSettings(),
         package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
         http=builder.one(root, "http", _server),

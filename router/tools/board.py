@@ -83,7 +83,7 @@ def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[St
         for plan in deadmen
         for endpoint, datagrams in plan.datagrams
         if endpoint == board
-        for payloads in [[*map(wire.decode, datagrams)]]
+        for payloads in [[wire.decode(datagram, wire.envelopes.to(board)) for datagram in datagrams]]
         for text in [", ".join(map(_described, payloads))]
         for payload in payloads
     ]
@@ -273,16 +273,16 @@ class Arrivals:
 class Inbox:
     """What one endpoint has received. `arrivals` and `frames` are by payload case; a basestation has no `board`."""
 
-    def __init__(self, wire: Wire, board: Board | None) -> None:
+    def __init__(self, wire: Wire, endpoint: str, board: Board | None) -> None:
         self.board = board
         self.arrivals: dict[str, Arrivals] = {}
         self.frames: dict[str, Frames] = {}
         self.undecodable = 0
-        self._wire = wire
+        self._wire, self._envelope = wire, wire.envelopes.to(endpoint)
 
     def take(self, now: float, datagram: bytes) -> None:
         try:
-            found = self._wire.decode_all(datagram)
+            found = self._wire.decode_all(datagram, self._envelope)
         except DecodeError:
             self.undecodable += 1
             return

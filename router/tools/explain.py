@@ -61,15 +61,16 @@ _LONGEST_NUMBER = 64
 
 
 def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
-    route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
+    route, case, table, envelopes = checked.route, checked.case, everything.table, everything.envelopes
     assert table is not None  # noqa: S101 - a table without errors is one
-    assert envelope is not None  # noqa: S101 - and has one
+    assert envelopes is not None  # noqa: S101 - and has envelopes
+    envelope = envelopes.of(route.case.value)
     yield f"{route.name}: {case.type.name}, {envelope.choice.place(envelope.name, case)}  ({route.span})"
     if case.max_size is not None:
         inside = f", {case.max_frame} in its envelope" if case.wrapping.tag else ""
         yield f"  largest encoding: {case.max_size} bytes{inside}"
-    elif everything.program is not None:
-        yield f"  largest encoding: none, because {everything.program.protos.unbounded(case.type.name)}"
+    else:
+        yield f"  largest encoding: none, because {envelope.schema.unbounded(case.type.name)}"
     if route.ignore is not None:
         yield f"  ignored: {route.ignore}"
         return
@@ -101,7 +102,7 @@ def tried_route(
 
     Raises UsageError for a route that takes no datagrams, and for words that do not fit.
     """
-    route, case, wire = checked.route, checked.case, Wire(program.envelope)
+    route, case, wire = checked.route, checked.case, Wire(program.envelopes)
     if not route.sources:
         raise UsageError(f"{route.name} has no 'source'", "--given is for routes that take datagrams")
     message, source = payload(case, words), route.sources[0].value

@@ -86,9 +86,9 @@ class Site:
 
 def site_of(checked: Checked, messages: Path) -> Site:
     """Return the site of a table without errors. Raises UsageError if it has no envelope."""
-    if checked.table is None or checked.envelope is None:
+    if checked.table is None or checked.envelopes is None:
         raise ValueError(f"{checked.path} has errors")
-    settings = checked.table.envelope
+    settings = checked.table.envelopes.get("")
     if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
     if settings.oneof is None:
@@ -96,7 +96,7 @@ def site_of(checked: Checked, messages: Path) -> Site:
         raise UsageError(f"{checked.path} has an envelope without a oneof: 'router new' adds members of a oneof", hint)
     # A field's type may be in a file of its own.
     schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude, with_others=True)
-    return Site(checked.table, settings, schema, checked.envelope, messages)
+    return Site(checked.table, settings, schema, checked.envelopes.first, messages)
 
 
 def prefix_of(board: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +111,7 @@ class Written:
 def locked(site: Site) -> str:
     """Return the lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
     schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
-    lock = LockComparison(schema, chosen_envelope(schema, site.settings.choice))
+    lock = LockComparison(chosen_envelope(schema, site.settings.choice))
     errors = [finding for finding in lock.findings() if finding.severity is Severity.ERROR]
     if errors:
         raise UsageError("; ".join(finding.message for finding in errors))
@@ -402,8 +402,8 @@ def _scalar(is_bool: bool, is_float: bool, place: int) -> object:
     return is_bool or place + (1.5 if is_float else 1)
 
 
-def _protos(table: RouteTable) -> Path | None:
-    return table.envelope.protos.value if table.envelope else None
+def _protos(table: RouteTable) -> Collection[Path]:
+    return {envelope.protos.value for envelope in table.envelopes.values()}
 
 
 def _indent(line: str) -> int:

@@ -21,7 +21,7 @@ from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools import udp
-from router.types.protobuf import Envelope
+from router.types.table_envelopes import Envelopes
 
 MOST_SOCKETS = 256
 
@@ -29,14 +29,14 @@ MOST_SOCKETS = 256
 class TapRecording:
     """A file, complete once it is closed; `datagrams` and `missed` are counts. Raises UsageError if it cannot write."""
 
-    def __init__(self, path: Path, envelope: Envelope, table: RouteTable) -> None:
+    def __init__(self, path: Path, envelopes: Envelopes, table: RouteTable) -> None:
         self.path = path
         self.datagrams = self.missed = 0
         channels = Channels()
         self._clock = Clock()
         self._encoder = Encoder(channels)
         self._waiting: list[Batch] = []
-        self._classifier = Classifier(envelope, table)
+        self._classifier = Classifier(envelopes, table)
         self._written_at = monotonic_ns()
         try:
             self._file = RecordingFile(path, channels, about(table, "router record"))

@@ -150,7 +150,7 @@ def _numbered(order: str, case: PayloadCase, wire: Wire) -> Numbered | None:
     """Return the first integer field that an expression reads."""
     for match in _PATH.finditer(order):
         first, *rest = steps = match[0].split(".")
-        beside = wire.envelope.beside if first == ENVELOPE else MessageType("")
+        beside = wire.envelopes.of(case.name).beside if first == ENVELOPE else MessageType("")
         payload = case.type if first == MESSAGE else MessageType("")
         for kind, path in ((case.type, steps), (payload, rest), (beside, rest)):
             if isinstance(found := type_at(kind, path), Int):
@@ -216,7 +216,7 @@ class Simulator:
             )
         self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
-        self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
+        self.statistics.inboxes = {name: Inbox(wire, name, played.get(name)) for name in table.endpoints}
         self._wire = wire
         self._table = table
         self._streams = tuple(streams(wire, table, seed, speed))
@@ -325,7 +325,7 @@ class Simulator:
             return
         message = stream.case.message_class()
         self._models[index].fill(message, self._pose(stream.endpoint, at, epoch))
-        around = self._wire.envelope.message_class()
+        around = self._wire.envelopes.of(stream.case.name).message_class()
         if stream.numbered is not None:
             self._numbers[index] += 1
             stream.numbered.set(around if stream.numbered.is_beside else message, self._numbers[index])

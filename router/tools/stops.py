@@ -16,6 +16,7 @@ from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT,
 from router.recording.reader import Recorded, RecordedAction
 from router.table.model.routes import ANY
 from router.tools.tap import local_time, utc_text
+from router.types.protobuf import Envelope
 from router.values.printing import compact, time_text
 
 _MS = 1_000_000
@@ -242,7 +243,6 @@ class Stops:
         self.has_actions = False
         self._routes = routes
         self._wire = wire
-        self._names = {case.number: case.name for case in wire.envelope.cases.values()}
         self._states = {name: _State() for name, route in routes.items() if route.timeout_ms}
         self._begin: int | None = None
         self._heard: dict[str, tuple[int, str]] = {}
@@ -266,7 +266,7 @@ class Stops:
                 last[route].obeyed.append(text)
 
     def _received(self, it: Recorded) -> None:
-        sender, case = it.endpoint or it.peer[0], self._case_of(it.data)
+        sender, case = it.endpoint or it.peer[0], _first_case(self._wire.envelopes.at(it.listener), it.data)
         self._heard[sender] = it.at, it.peer[0]
         for state in self._states.values():
             if (stop := state.stop) is not None and sender in (*stop.settings.sources, *stop.settings.brakes):
@@ -298,7 +298,7 @@ class Stops:
         elif it.what == RELEASED and state.stop is not None:
             state.stop.released, state.stop = it.at, None
         elif it.what == BRAKED and state.stop is not None:
-            case = self._case_of(it.data)
+            case = _first_case(self._wire.envelopes.to(it.target), it.data)
             state.stop.brakes[case, it.target, ": ".join(filter(None, (it.reason, it.detail)))] += 1
 
     def _tripped(self, it: Action, state: _State) -> None:
@@ -308,12 +308,9 @@ class Stops:
         self.found.append(state.stop)
 
     def _fed(self, it: Action) -> Fed:
-        decoded = self._wire.decode(it.data)
+        decoded = self._wire.decode(it.data, self._wire.envelopes.to(it.target))
         sender = f"topic {it.topic}" if it.topic else self._sender(it.route)
         return Fed(it.at, decoded.case.name, compact(decoded.message, decoded.case.type), sender)
-
-    def _case_of(self, data: bytes) -> str:
-        return next((self._names[number] for number in self._wire.envelope.choice.numbers_in(data, self._names)), "")
 
     def _sender(self, route: str) -> str:
         """Return who sent the last command that the route accepted; "" if that is not in the recording."""
@@ -321,6 +318,10 @@ class Stops:
         known = self._commands.get(settings.case, {})
         senders = [sender for sender in known if sender in settings.sources or ANY in settings.sources]
         return max(senders, key=lambda sender: known[sender], default="")
+
+
+def _first_case(envelope: Envelope, data: bytes) -> str:
+    return next(iter(envelope.cases_in(data)), "")
 
 
 def _clock(at: int) -> str:

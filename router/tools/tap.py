@@ -43,7 +43,7 @@ class Condition:
     example because of a division by zero: there it counts as false.
     """
 
-    def __init__(self, text: str, envelope: Envelope, cases: Sequence[PayloadCase]) -> None:
+    def __init__(self, text: str, cases: Sequence[PayloadCase]) -> None:
         """Parse the expression. Raises UsageError if it fits none of the cases, StartError without a library."""
         self.failure = ""
         self._conditions: dict[str, NativeCondition] = {}
@@ -289,7 +289,7 @@ def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
 
 
 def listen(
-    receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]
+    receiver: socket.socket, wire: Wire, envelope: Envelope, name_of: Callable[[tuple[str, int]], str]
 ) -> Iterator[list[TappedDatagram]]:
     """Yield datagrams one by one without end; after PATIENCE without one, an empty list."""
     receiver.settimeout(PATIENCE)
@@ -299,13 +299,18 @@ def listen(
         except TimeoutError:
             yield []
         else:
-            yield tapped_datagram(wall_ns(), name_of(peer), data, wire)
+            yield tapped_datagram(wall_ns(), name_of(peer), data, wire, envelope=envelope)
 
 
-def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> list[TappedDatagram]:
-    """Return a datagram that was received at `at`, ns since 1970, once for each of its messages."""
+def tapped_datagram(
+    at: int, peer: str, data: bytes, wire: Wire, rejected: str = "", envelope: Envelope | None = None
+) -> list[TappedDatagram]:
+    """Return a datagram that was received at `at`, ns since 1970, once for each of its messages.
+
+    `envelope` is as in `Wire.decode`.
+    """
     try:
-        found = wire.decode_all(data)
+        found = wire.decode_all(data, envelope)
     except DecodeError as error:
         return [TappedDatagram(local_time(at), peer, data, None, str(error), rejected)]
     return [TappedDatagram(local_time(at), peer, data, decoded, rejected=rejected) for decoded in found]
@@ -314,9 +319,10 @@ def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str =
 def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> Sequence[TappedDatagram | ShownAction]:
     """Return each message of a datagram, or an action, as it is printed."""
     if not isinstance(it, Action):
-        return tapped_datagram(it.at, it.endpoint or f"{it.peer[0]}:{it.peer[1]}", it.data, wire, it.reason)
+        peer, envelope = it.endpoint or f"{it.peer[0]}:{it.peer[1]}", wire.envelopes.at(it.listener)
+        return tapped_datagram(it.at, peer, it.data, wire, it.reason, envelope)
     try:
-        decoded = wire.decode(it.data) if it.what in (SENT, BRAKED) and it.data else None
+        decoded = wire.decode(it.data, wire.envelopes.to(it.target)) if it.what in (SENT, BRAKED) and it.data else None
     except DecodeError:
         decoded = None
     return [ShownAction(local_time(it.at), it, decoded)]

@@ -17,6 +17,8 @@ from router.table.addresses import Address, SerialPlace
 if TYPE_CHECKING:
     from router.table.model import RouteTable
     from router.table.model.endpoints import Endpoint, Listener
+    from router.types.protobuf import Envelope
+    from router.types.table_envelopes import Envelopes
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"
@@ -46,6 +48,20 @@ def listening(text: str, table: RouteTable | None) -> Address:
         raise _not_a_place(text, table, "[HOST:]PORT")
     _refuse_port_of_name(host, text, table)
     return Address(_resolve(host) if host else ANY_HOST, _port(port, lowest=0))
+
+
+def received_at(address: Address, table: RouteTable, envelopes: Envelopes) -> Envelope:
+    """Return the envelope that an endpoint or listener with this address receives, by default the first one."""
+    hosts = (address.host, ANY_HOST)
+    for endpoint in table.endpoints.values():
+        if endpoint.address.value == address or (
+            address.host == ANY_HOST and endpoint.address.value.port == address.port
+        ):
+            return envelopes.to(endpoint.name)
+    for listener in table.listeners.values():
+        if listener.address.value.port == address.port and listener.address.value.host in hosts:
+            return envelopes.at(listener.name)
+    return envelopes.first
 
 
 def origin(text: str, table: RouteTable | None) -> Address:

@@ -46,6 +46,7 @@ def shared_envelope(schema: ProtoSchema, names: Sequence[Located[str]]) -> Envel
     beside = tuple(member for member in schema.messages[envelope.full_name].fields if member.name not in cases)
     return Envelope(
         envelope.full_name,
+        schema,
         ByCases([*cases]),
         schema.message_class(envelope.full_name),
         cases,
@@ -78,7 +79,7 @@ def framed_envelope(schema: ProtoSchema, name: Located[str]) -> Envelope:
     size = largest_encoding(message, schema.board_options)
     made = schema.message_class(schema.envelope)
     case = PayloadCase(name.value, ONLY_CASE, schema.messages[schema.envelope], made, size, Wrapping(0))
-    return Envelope(schema.envelope, ByFrame(name.value), made, {case.name: case}, size or 0)
+    return Envelope(schema.envelope, schema, ByFrame(name.value), made, {case.name: case}, size or 0)
 
 
 def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str]) -> Envelope:
@@ -111,6 +112,7 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
     members = tuple(member for member in schema.messages[envelope.full_name].fields if member.name in names)
     return Envelope(
         envelope.full_name,
+        schema,
         ByName(
             (of_name.name, of_name.number),
             (of_payload.name, of_payload.number),

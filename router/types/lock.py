@@ -58,8 +58,8 @@ class LockComparison:
     declarations, `faults` are problems with the file itself.
     """
 
-    def __init__(self, schema: ProtoSchema, envelope: Envelope, table: Path | None = None) -> None:
-        self._schema = schema
+    def __init__(self, envelope: Envelope, table: Path | None = None) -> None:
+        self._schema = schema = envelope.schema
         self._envelope = envelope
         self._current = _current_lock(schema, envelope)
         self.lock: Lock | None = None
@@ -73,6 +73,10 @@ class LockComparison:
         self._command = _command(schema, envelope, self.lock, table)
         if self.lock is not None:
             self._compare_with(self.lock)
+
+    @property
+    def path(self) -> Path:
+        return self._schema.lock
 
     @property
     def max_size(self) -> int | None:

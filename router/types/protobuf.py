@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
@@ -161,16 +162,18 @@ class Unroutable:
     wire_type: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Envelope:
-    """The message around every payload, by full name. `beside` has only its fields beside the payload.
+    """The message around payloads, by full name. `beside` has only its fields beside the payload.
 
     `max_size` is its largest encoding in bytes, nanopb's `PBEnvelope_size`; unbounded cases do not count. `choice` says
     which of the `cases` a frame holds; `unroutable` are those that no route can take, `parts` those that are also parts
-    of other messages, and therefore need no route.
+    of other messages, and therefore need no route. `schema` declares its types; that of a recording is empty. Compared
+    by identity.
     """
 
     name: str
+    schema: ProtoSchema
     choice: Choice
     message_class: MessageClass
     cases: Mapping[str, PayloadCase]
@@ -184,6 +187,14 @@ class Envelope:
         """The numbers of all cases, also of those that no route can take."""
         numbers = {name: case.number for name, case in self.cases.items()}
         return numbers | {name: member.number for name, member in self.unroutable.items()}
+
+    @cached_property
+    def _names(self) -> Mapping[int, str]:
+        return {number: name for name, number in self.numbers.items()}
+
+    def cases_in(self, datagram: bytes) -> Sequence[str]:
+        """Return the cases that a datagram seems to hold: it is not parsed (`Choice.numbers_in`)."""
+        return [self._names[number] for number in self.choice.numbers_in(datagram, self._names)]
 
     def members_of(self, frame: Message) -> Sequence[str]:
         """Return the names of the cases that a parsed frame holds, even of those that no route can take."""
@@ -292,10 +303,14 @@ def _note_hidden(folder: Folder, compiled: Collection[str]) -> None:
             inputs.read_bytes(folder.root / name)
 
 
-def without_protos() -> tuple[ProtoSchema, Envelope]:
-    """Return empty declarations, and an envelope without payload cases, for a table without an envelope."""
-    schema = ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
-    return schema, Envelope("", ByOneof(""), Empty, {}, 0)
+def no_protos() -> ProtoSchema:
+    """Return empty declarations."""
+    return ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
+
+
+def no_envelope() -> Envelope:
+    """Return an envelope without payload cases, for a table without an envelope."""
+    return Envelope("", no_protos(), ByOneof(""), Empty, {}, 0)
 
 
 def lock_path(protos: Located[Path], lock: Located[Path] | None) -> Path:
@@ -417,7 +432,14 @@ def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
     }
     beside = tuple(member for member in schema.messages[name].fields if member.oneof != oneof.name)
     return Envelope(
-        name, ByOneof(oneof.name), schema.message_class(name), cases, max_size, unroutable, MessageType(name, beside)
+        name,
+        schema,
+        ByOneof(oneof.name),
+        schema.message_class(name),
+        cases,
+        max_size,
+        unroutable,
+        MessageType(name, beside),
     )
 
 

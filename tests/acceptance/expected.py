@@ -45,7 +45,7 @@ def _in_board_units(field: FieldDescriptor, value: Any) -> Any:
 
 def from_board_units(case: str, values: Values) -> Sample:
     """The inverse: the payload expected for a `comms` message. A ROS message cannot leave a nested message out."""
-    payload = WIRE.envelope.cases[case].message_class()
+    payload = WIRE.envelopes.first.cases[case].message_class()
     _fill(payload, values)
     return sample(case, payload)
 

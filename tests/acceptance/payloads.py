@@ -50,7 +50,7 @@ class Sample(NamedTuple):
 
 
 def sample(case: str, payload: Message) -> Sample:
-    return Sample(case, WIRE.encode(WIRE.envelope.cases[case], payload), payload)
+    return Sample(case, WIRE.encode(WIRE.envelopes.first.cases[case], payload), payload)
 
 
 def golden(datagram: bytes) -> Sample:
@@ -64,7 +64,7 @@ def generated(case: str) -> Iterator[Sample]:
     values += [partial(_sparse, random.Random(f"{case} sparse {seed}")) for seed in range(2)]
     values += [partial(_limit, turn) for turn in range(max(map(len, _LIMITS.values())))]
     for value in values:
-        payload = WIRE.envelope.cases[case].message_class()
+        payload = WIRE.envelopes.first.cases[case].message_class()
         _fill(payload, value)
         yield sample(case, payload)
 
@@ -74,10 +74,10 @@ def for_boards(case: str) -> Iterator[Sample]:
 
     Encoders leave zeros out, but decoders must also accept explicit zeros.
     """
-    payload_class = WIRE.envelope.cases[case].message_class
+    payload_class = WIRE.envelopes.first.cases[case].message_class
     yield sample(case, payload_class())
     zeros = _zeros(payload_class.DESCRIPTOR)
-    yield Sample(case, delimited(WIRE.envelope.cases[case].number, zeros), payload_class.FromString(zeros))
+    yield Sample(case, delimited(WIRE.envelopes.first.cases[case].number, zeros), payload_class.FromString(zeros))
     for made in generated(case):
         _declare(made.payload)
         yield sample(case, made.payload)
@@ -108,7 +108,7 @@ def arbitrary(case: str, seed: int = 0) -> Iterator[Sample]:
     """Endless samples of one payload case: any value of each field, including NaN, infinities and absence."""
     value = partial(_any, random.Random(f"{case} arbitrary {seed}"))
     while True:
-        payload = WIRE.envelope.cases[case].message_class()
+        payload = WIRE.envelopes.first.cases[case].message_class()
         _fill(payload, value)
         yield sample(case, payload)
 

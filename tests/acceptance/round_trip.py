@@ -37,7 +37,7 @@ def table(place: Site, publishes: str, listens: str) -> dict[str, Any]:
         "http": {"address": f"127.0.0.1:{place.metrics}"},
         "listen": {"all": {"address": f"{ROUTER}:{place.listen}", "receive_buffer": "4MiB"}},
         "endpoints": {NEAR: {"address": f"{host}:{port}", "kind": "tool"}},
-        "routes": {case.name: _routes(case, publishes, listens) for case in WIRE.envelope.cases.values()},
+        "routes": {case.name: _routes(case, publishes, listens) for case in WIRE.envelopes.first.cases.values()},
     }
 
 
@@ -89,7 +89,9 @@ def carried(start: Site, end: Site, samples: Iterable[Sample]) -> Iterator[tuple
 
 def _connected(start: Site, end: Site) -> None:
     """Wait until publishers and subscriptions have matched and no message is in flight."""
-    empty = {case: sample(case, WIRE.envelope.cases[case].message_class()) for case in WIRE.envelope.cases}
+    empty = {
+        case: sample(case, WIRE.envelopes.first.cases[case].message_class()) for case in WIRE.envelopes.first.cases
+    }
     seen: set[str] = set()
 
     def all_seen() -> bool:

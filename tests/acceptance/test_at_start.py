@@ -52,7 +52,7 @@ SENT = "the deadman has sent its payload at startup"
 
 
 def envelope(case: str, **values: object) -> bytes:
-    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+    return sample(case, WIRE.envelopes.first.cases[case].message_class(**values)).datagram
 
 
 DRIVE, BRAKE, ARM = envelope("manual_drive", turn=5), envelope("manual_brake", brake=True), envelope("manual_arm")

@@ -26,7 +26,7 @@ from tests.boards.mutating import Mutator
 from tests.ports import free_port
 
 WIRE = wire_of_protos(PARTS)
-LARGEST = WIRE.envelope.max_size
+LARGEST = WIRE.envelopes.first.max_size
 """Bytes of the largest envelope that the board takes."""
 
 TABLE = """\
@@ -105,7 +105,7 @@ TOPICS = {
 
 def envelope(case: str, payload: bytes = b"", **values: Any) -> bytes:
     """An envelope with a payload of these values, and of these bytes after them."""
-    found = WIRE.envelope.cases[case]
+    found = WIRE.envelopes.first.cases[case]
     return delimited(found.number, found.message_class(**values).SerializeToString() + payload)
 
 
@@ -380,7 +380,7 @@ NOT_CHECKED = {"wrong wire type", "invalid wire_type", "integer too large", "var
 def is_expected(verdict: Verdict) -> bool:
     """Whether the board obeys, or refuses what the router does not check."""
     if verdict.refused == "array overflow":  # it looks at the wire type of one element too many later
-        return has_other_wire_types(WIRE.envelope.message_class.FromString(verdict.datagram))
+        return has_other_wire_types(WIRE.envelopes.first.message_class.FromString(verdict.datagram))
     return verdict.refused in {"", *NOT_CHECKED}
 
 

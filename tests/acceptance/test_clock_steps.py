@@ -102,7 +102,7 @@ class Trial:
 
 
 def test_datagrams(place: Site, clock: Clock) -> None:
-    datagram = sample("manual_drive", WIRE.envelope.cases["manual_drive"].message_class(turn=5)).datagram
+    datagram = sample("manual_drive", WIRE.envelopes.first.cases["manual_drive"].message_class(turn=5)).datagram
     trial = Trial(place, "manual_drive", lambda: place.send("basestation", datagram))
     with RouterProcess(place.folder, place.table(BARE + ROUTES), **clock.environment) as router:
         sent, stale = trial.stall(clock, router)

@@ -66,7 +66,7 @@ Running = tuple[Site, RouterProcess]
 
 
 def part(camera: str, frame: int, count: int, index: int, like: Any = None) -> Part:
-    payload: Any = WIRE.envelope.cases["detected_object"].message_class()
+    payload: Any = WIRE.envelopes.first.cases["detected_object"].message_class()
     if like is not None:
         payload.CopyFrom(like)
     payload.frame_id, payload.total_count, payload.index = frame, count, index

@@ -31,7 +31,7 @@ routes:
     ttl: 200ms
     deadman: {{timeout: 500ms, repeat: 500ms, at_start: silent, send: {{manual_brake: {{brake: true}}}}}}
 """
-DRIVE = WIRE.envelope.message_class(manual_drive={"forward_backward": 50, "turn": -3}).SerializeToString()
+DRIVE = WIRE.envelopes.first.message_class(manual_drive={"forward_backward": 50, "turn": -3}).SerializeToString()
 
 FORWARD = """\
 import socket, sys, time

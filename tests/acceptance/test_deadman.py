@@ -43,7 +43,7 @@ class Command(NamedTuple):
 
 
 def _envelope(case: str, **values: Any) -> bytes:
-    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+    return sample(case, WIRE.envelopes.first.cases[case].message_class(**values)).datagram
 
 
 BRAKE = _envelope("manual_brake", brake=True)

@@ -23,7 +23,7 @@ from tests.observe.foxglove_client import FoxgloveClient
 from tests.ports import free_port
 from tests.repeating import repeating
 
-CASES = [*wire().envelope.cases]
+CASES = [*wire().envelopes.first.cases]
 ACCEPTED = {**usual(), **odd()}
 DATAGRAMS = {**ACCEPTED, **unroutable()}
 

@@ -34,7 +34,7 @@ listen: {{rover: {{address: 127.0.0.5:LISTEN}}}}
 routes:
   imu_info: {{source: any, topics: [{{topic: gw/imu, type: comms/msg/ImuSensorInformation, fields: auto}}]}}
 """
-IMU = sample("imu_info", WIRE.envelope.cases["imu_info"].message_class(accel_x=1.5)).datagram
+IMU = sample("imu_info", WIRE.envelopes.first.cases["imu_info"].message_class(accel_x=1.5)).datagram
 
 
 def asked(port: int, path: str) -> str:

@@ -63,7 +63,7 @@ PARAMETERS = "/**: {ros__parameters: {deadman: 1h}}\n"
 
 
 def envelope(case: str, **values: object) -> bytes:
-    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+    return sample(case, WIRE.envelopes.first.cases[case].message_class(**values)).datagram
 
 
 def ph(number: float) -> bytes:

@@ -51,7 +51,7 @@ def test_every_case_goes_to_both_addresses_and_four_to_topics(tmp_path: Path) ->
         arguments = ("--ros-args", "-p", "{}:={}".format(*first), "--params-file", path)
         with RouterProcess(tmp_path, LEGACY, *arguments, **environment) as router, RosPeer(TOPICS) as peer:
             subscribed(place, peer)
-            for case in WIRE.envelope.cases:
+            for case in WIRE.envelopes.first.cases:
                 for sent in generated(case):
                     assert_both_get(place, sent.datagram)
                     if case in CASES:
@@ -78,7 +78,7 @@ def subscribed(place: Site, peer: RosPeer) -> None:
 
     wait_until(all_seen, "a message on each topic")
     # More may be on their way. On each topic they come before what is sent from here on: an empty payload.
-    empty = {case: WIRE.envelope.cases[case].message_class() for case in CASES}
+    empty = {case: WIRE.envelopes.first.cases[case].message_class() for case in CASES}
     for case, payload in empty.items():
         assert_both_get(place, sample(case, payload).datagram)
     last = {CASES[case]: in_board_units(payload) for case, payload in empty.items()}

@@ -35,7 +35,7 @@ ROUTES = "routes:\n" + "".join(
     - {{{{source: basestation, destinations: [board, other_board, trimming_board], deadman: {{{{none: for tests}}}}}}}}
     - {{{{source: board, destinations: basestation}}}}
 """
-    for case in WIRE.envelope.cases
+    for case in WIRE.envelopes.first.cases
 )
 TRIMMED = """\
 version: 1
@@ -50,12 +50,12 @@ REDUNDANT = tuple(map(bytes.fromhex, ("c2018000", "c201808000", "c20180808000"))
 
 
 def drive(**values: int) -> bytes:
-    return sample("manual_drive", WIRE.envelope.cases["manual_drive"].message_class(**values)).datagram
+    return sample("manual_drive", WIRE.envelopes.first.cases["manual_drive"].message_class(**values)).datagram
 
 
 RELEASED = drive()
 FORWARD = drive(forward_backward=100)
-MANUAL_DRIVE = WIRE.envelope.cases["manual_drive"].number
+MANUAL_DRIVE = WIRE.envelopes.first.cases["manual_drive"].number
 
 
 class Link(NamedTuple):
@@ -107,10 +107,10 @@ def framings(exact: bytes) -> Sequence[bytes]:
 
 def obeyed(made: Sample) -> Verdict:
     """What the board says of an envelope with these values, whatever its encoding was."""
-    return Verdict(WIRE.envelope.cases[made.case].number, sample(made.case, made.payload).datagram)
+    return Verdict(WIRE.envelopes.first.cases[made.case].number, sample(made.case, made.payload).datagram)
 
 
-@pytest.mark.parametrize("case", WIRE.envelope.cases)
+@pytest.mark.parametrize("case", WIRE.envelopes.first.cases)
 def test_boards_get_the_exact_envelope_in_whatever_framing_it_came(link: Link, case: str) -> None:
     for made in for_boards(case):
         exact = made.datagram
@@ -118,7 +118,7 @@ def test_boards_get_the_exact_envelope_in_whatever_framing_it_came(link: Link, c
             assert link.arrivals(datagram) == (obeyed(made), exact, exact.rstrip(b"\0")), datagram.hex()
 
 
-@pytest.mark.parametrize("case", WIRE.envelope.cases)
+@pytest.mark.parametrize("case", WIRE.envelopes.first.cases)
 def test_the_router_reads_what_it_has_trimmed_itself(link: Link, case: str) -> None:
     for made in for_boards(case):
         *_, trimmed = link.arrivals(made.datagram)
@@ -132,20 +132,20 @@ def test_a_length_that_was_cut_at_the_end_gets_its_zero_back(link: Link, exact: 
     assert link.arrivals(exact.rstrip(b"\0")) == (released, exact, exact.rstrip(b"\0"))
 
 
-@pytest.mark.parametrize("case", WIRE.envelope.cases)
+@pytest.mark.parametrize("case", WIRE.envelopes.first.cases)
 def test_a_basestation_reads_the_exact_envelope_in_whatever_framing_a_board_sends(link: Link, case: str) -> None:
     for made in for_boards(case):
         for form in ("exact", "trimmed", "padded"):
             link.board.send(form, made.datagram)
             arrived = link.place.receive("basestation")
             assert arrived == sample(case, made.payload).datagram
-            assert WIRE.envelope.message_class.FromString(arrived).WhichOneof("payload") == case
+            assert WIRE.envelopes.first.message_class.FromString(arrived).WhichOneof("payload") == case
         for datagram in framings(made.datagram):
             link.board.send("raw", datagram)
             assert link.place.receive("basestation") == made.datagram
 
 
-@pytest.mark.parametrize("case", WIRE.envelope.cases)
+@pytest.mark.parametrize("case", WIRE.envelopes.first.cases)
 def test_where_framing_is_exact_nothing_is_repaired(link: Link, case: str) -> None:
     before, refused = link.place.scrape(), 0
     for made in for_boards(case):

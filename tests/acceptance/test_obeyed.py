@@ -35,7 +35,7 @@ STOPPED, DISOBEYED = "the board has stopped", "the board does not obey the brake
 
 
 def envelope(case: str, **values: object) -> bytes:
-    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+    return sample(case, WIRE.envelopes.first.cases[case].message_class(**values)).datagram
 
 
 DRIVE, MOVES = envelope("manual_drive", turn=5), envelope("drive_diag", front_left_motor={"rpm": 300})

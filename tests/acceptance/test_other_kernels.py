@@ -21,7 +21,7 @@ routes:
   manual_drive: {{source: basestation, destinations: driving_board, ttl: 200ms, deadman: {{none: for this test}}}}
 """
 )
-DRIVE = WIRE.envelope.message_class(manual_drive={"turn": 5}).SerializeToString()
+DRIVE = WIRE.envelopes.first.message_class(manual_drive={"turn": 5}).SerializeToString()
 OLD, OLD_FOR_S = 3, 0.5
 FLOOD = 1000
 ASKS = "the kernel does not send arrival times with datagrams: each datagram costs one more system call"

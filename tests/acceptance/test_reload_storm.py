@@ -32,7 +32,7 @@ from tests.tables import PROTOS
 SECONDS = float(os.environ.get("STORM_SECONDS", "40"))
 HOSTS = {"sensor": "127.0.0.30", "station": "127.0.0.31", "driving": "127.0.0.32", "arm": "127.0.0.33"}
 HOSTS["radio"] = "127.0.0.34"
-BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+BRAKE = WIRE.envelopes.first.message_class(manual_brake={"brake": True}).SerializeToString()
 PARTS, BURST = 3, 20
 MOST_GROWTH = 0.05
 ENOUGH = 120
@@ -184,7 +184,7 @@ class Receiving:
 
     def of(self, case: str, number: Callable[[Any], float]) -> list[float]:
         """The numbers in the payloads of a case."""
-        envelopes = map(WIRE.envelope.message_class.FromString, self.datagrams)
+        envelopes = map(WIRE.envelopes.first.message_class.FromString, self.datagrams)
         return [number(getattr(each, case)) for each in envelopes if each.WhichOneof("payload") == case]
 
     def stop(self) -> None:
@@ -210,7 +210,7 @@ def start_sending(boards: dict[str, socket.socket], drives: Publisher, listen: i
     """All that comes, by name."""
 
     def by(board: str, **payload: Any) -> None:
-        data = WIRE.envelope.message_class(**payload).SerializeToString()
+        data = WIRE.envelopes.first.message_class(**payload).SerializeToString()
         boards[board].sendto(data, ("127.0.0.1", listen))
 
     def burst(number: int) -> None:

@@ -50,7 +50,7 @@ routes:
 
 
 def envelope(case: str, **values: object) -> bytes:
-    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+    return sample(case, WIRE.envelopes.first.cases[case].message_class(**values)).datagram
 
 
 class Stream:

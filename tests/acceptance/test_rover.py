@@ -447,7 +447,7 @@ def without_stamp(message: dict[str, Any]) -> float | None:
 
 def test_a_value_that_a_mapping_cannot_take_is_told_with_the_line_of_the_table(watched: Rover) -> None:
     """Sine of infinity is no number: `gps/vel` goes without, the other targets are served."""
-    payload = WIRE.envelope.cases["gps_info"].message_class(heading=float("inf"), speed=1.0)
+    payload = WIRE.envelopes.first.cases["gps_info"].message_class(heading=float("inf"), speed=1.0)
     datagram = sample("gps_info", payload).datagram
     place, router = watched.site, watched.router
     before = place.scrape()

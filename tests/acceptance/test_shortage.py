@@ -31,8 +31,8 @@ gateways:
   operator: {{transport: {{tcp: 127.0.0.1:PORT}}, format: json_lines}}
 """
 )
-DRIVE = WIRE.envelope.message_class(manual_drive={"forward_backward": 50}).SerializeToString()
-BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+DRIVE = WIRE.envelopes.first.message_class(manual_drive={"forward_backward": 50}).SerializeToString()
+BRAKE = WIRE.envelopes.first.message_class(manual_brake={"brake": True}).SerializeToString()
 CLIENTS = 40
 
 

@@ -18,7 +18,7 @@ BASESTATION, BOARD = ("10.78.2.10", 9000), ("10.78.1.222", 8)
 LAN, RADIO = ("10.78.1.1", 5000), ("10.78.2.1", 5000)
 """The rover's address in each network."""
 DRIVE = WIRE.encode(WIRE.case("manual_drive"), WIRE.case("manual_drive").message_class())
-BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+BRAKE = WIRE.envelopes.first.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
 @dataclass

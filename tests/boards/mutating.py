@@ -20,7 +20,7 @@ class Mutator:
     """Random envelopes; the same seed gives the same ones."""
 
     def __init__(self, wire: Wire, seed: int) -> None:
-        self._cases = list(wire.envelope.cases.values())
+        self._cases = list(wire.envelopes.first.cases.values())
         self._rng = random.Random(seed)
 
     def envelope(self) -> bytes:

@@ -69,7 +69,7 @@ class CarrierSide:
 
     def __init__(self, library: ctypes.CDLL, made: CompiledTable) -> None:
         self._memory = Arrays()
-        self._schema = write_schema(made.envelope, made.inbound, self._memory)
+        self._schema = write_schema(made.envelopes.first, made.inbound, self._memory)
         self._read = library.envelope_read
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
         self._part = library.envelope_part

@@ -17,6 +17,7 @@ from router.rehearsal.cdr import deserialize
 from router.table.model.targets import Topic
 from router.types.model import Bool, Field, Float, Int, MessageType, Type
 from router.types.protobuf import PayloadCase
+from router.types.table_envelopes import Envelopes
 from tests.carrier.delivering import Delivering, Payload
 from tests.carrier.messages import payloads
 from tests.compiler.compiling import SPAN, field_map
@@ -61,7 +62,7 @@ def test_fields_beside_a_payload_are_those_that_protobuf_parses(delivering: CDLL
     assert not mapping.findings
     route: Any = SimpleNamespace(name="route", ttl=None, ignore=None, span=SPAN)
     target = Target(Topic(Located("topic", SPAN), SPAN), type=TARGET, plan=mapping.plan)
-    lowered, findings = lower_table([CheckedRoute(route, case, (target,))], ENVELOPE)
+    lowered, findings = lower_table([CheckedRoute(route, case, (target,))], Envelopes({"": ENVELOPE}))
     assert not findings
     carrier = Delivering(delivering, lowered.to_topics["route"])
 

@@ -84,7 +84,7 @@ def type_of(topic: str) -> MessageType:
 
 
 def envelope(case: str, **fields: Any) -> bytes:
-    made: Any = program().envelope.message_class()
+    made: Any = program().envelopes.first.message_class()
     getattr(made, case).SetInParent()
     for name, value in fields.items():
         setattr(getattr(made, case), name, value)

@@ -40,18 +40,18 @@ def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
     """The decision of the carrier, which has to be the oracle's; what it says of the payload is checked too."""
     made, carrier = sides
     decision = carrier.decide(data, repairs)
-    assert decision == decide(made.envelope, made.inbound, data, MAX_DATAGRAM, repairs)
-    if decision.reason is None and isinstance(made.envelope.choice, ByCases) and decision.superseded:
-        assert [*carrier.parts()] == parts(made.envelope, carrier.whole())
+    assert decision == decide(made.envelopes.first, made.inbound, data, MAX_DATAGRAM, repairs)
+    if decision.reason is None and isinstance(made.envelopes.first.choice, ByCases) and decision.superseded:
+        assert [*carrier.parts()] == parts(made.envelopes.first, carrier.whole())
         return decision
-    if decision.reason is None and decision.number in {case.number for case in made.envelope.cases.values()}:
-        case = next(case for case in made.envelope.cases.values() if case.number == decision.number)
-        payload, parse = carrier.payload(), made.envelope.message_class.FromString
+    if decision.reason is None and decision.number in {case.number for case in made.envelopes.first.cases.values()}:
+        case = next(case for case in made.envelopes.first.cases.values() if case.number == decision.number)
+        payload, parse = carrier.payload(), made.envelopes.first.message_class.FromString
         found = payload.of(carrier.whole())
         assert payload.is_single or read_varint(found, 0)[0] == case.number << 3 | LEN
         try:
             alone = case.message_class.FromString(found) if payload.is_single else getattr(parse(found), case.name)
-            ((_, held),) = made.envelope.payloads_of(parse(carrier.whole()))
+            ((_, held),) = made.envelopes.first.payloads_of(parse(carrier.whole()))
         except DecodeError:  # one level too deep for the envelope
             return decision
         assert alone.SerializePartialToString() == held.SerializePartialToString()
@@ -63,7 +63,7 @@ def decided(sides: Sides, data: bytes, repairs: bool = True) -> Decision:
 def test_pieces_of_the_wire_format(
     sides: Mapping[str, Sides], schema: str, noise: random.Random, repairs: bool
 ) -> None:
-    decided(sides[schema], maker_for(sides[schema][0].envelope, noise).datagram(), repairs)
+    decided(sides[schema], maker_for(sides[schema][0].envelopes.first, noise).datagram(), repairs)
 
 
 @given(data=damaged(), repairs=st.booleans())
@@ -80,7 +80,7 @@ def test_any_bytes(sides: Mapping[str, Sides], schema: str, data: bytes, repairs
 @pytest.mark.parametrize("schema", SCHEMAS)
 @pytest.mark.parametrize("seed", [*range(20), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(20, 100))])
 def test_a_thousand_of_each_seed(sides: Mapping[str, Sides], schema: str, seed: int) -> None:
-    maker = maker_for(sides[schema][0].envelope, random.Random(seed))
+    maker = maker_for(sides[schema][0].envelopes.first, random.Random(seed))
     for _ in range(1000):
         decided(sides[schema], maker.datagram(), seed % 3 != 0)
 

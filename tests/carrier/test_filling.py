@@ -82,8 +82,8 @@ def filled(made: Checked, number: int, wall: int) -> Any:
     data = ctypes.create_string_buffer(beside.data, len(beside.data))
     library().beside_fill(ctypes.byref(of), data, wall)
     assert sequence.value == number
-    assert made.envelope is not None
-    return made.envelope.message_class.FromString(data.raw)
+    assert made.envelopes is not None
+    return made.envelopes.first.message_class.FromString(data.raw)
 
 
 @pytest.fixture(scope="module")
@@ -144,8 +144,8 @@ def test_a_required_field_inside_a_field_that_is_set_needs_a_value(tmp_path: Pat
 
 def sent(rehearsal: Rehearsal, made: Checked) -> list[Mapping[str, Any]]:
     """The numbers of what was sent since the last call."""
-    assert made.envelope is not None
-    parse = made.envelope.message_class.FromString
+    assert made.envelopes is not None
+    parse = made.envelopes.first.message_class.FromString
     frames: list[Any] = [parse(event.data) for event in rehearsal.events if isinstance(event, Sent)]
     rehearsal.events.clear()
     return [{field.name: value for field, value in frame.numbers.ListFields()} for frame in frames]

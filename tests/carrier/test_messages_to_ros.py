@@ -70,7 +70,7 @@ def test_topics_of_tables_get_what_the_oracle_makes(library: CDLL, delivering: C
 
 
 def _assert_allowed(library: CDLL, reading: CarrierSide, program: CompiledTable, route: CheckedRoute) -> None:
-    lowered, case, envelope = program.lowered.to_topics[route.route.name], route.case, program.envelope
+    lowered, case, envelope = program.lowered.to_topics[route.route.name], route.case, program.envelopes.first
     topics = [target for target in route.targets if target.topic]
     assert lowered.targets.keys() == {topic.label for topic in topics}
     carrier, enums = Delivering(library, lowered, RECEIVED_AT, SOURCE), rover_wire()[0].enums.values()
@@ -84,13 +84,18 @@ def _assert_allowed(library: CDLL, reading: CarrierSide, program: CompiledTable,
             make = partial(published, topic.type, topic.declared.fields, context)
             assert verdict(make, topic.declared.when, context).allows(got[topic.label])
 
+    routed = [program.envelopes.numbers[name] for name in program.inbound]
+
     @EACH_TYPE
     @given(payloads(case), st.randoms())
     def allowed(made: list[bytes], noise: random.Random) -> None:
         for payload in made:
             check(payload, case.message_class.FromString(payload))
             parts = [delimited(case.number, payload), delimited(case.number, noise.choice(made))]
-            parts += [delimited(30, b"unknown"), delimited(noise.choice([*program.inbound]), b"")]
+            parts += [
+                delimited(30, b"unknown"),
+                delimited(noise.choice(routed), b""),
+            ]
             noise.shuffle(parts)
             whole = b"".join(parts)
             parsed: Any = envelope.message_class.FromString(whole)

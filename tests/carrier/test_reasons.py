@@ -55,7 +55,7 @@ def notes(tmp_path: Path) -> Callable[[str], CompiledTable]:
 
 
 def note(folder: Path, **fields: Any) -> bytes:
-    message = wire_of_protos(folder / "protos").envelope.message_class(note=fields)
+    message = wire_of_protos(folder / "protos").envelopes.first.message_class(note=fields)
     return bytes(message.SerializeToString())
 
 

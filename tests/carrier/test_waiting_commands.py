@@ -118,7 +118,7 @@ def paced(rehearse: Rehearse) -> Rehearsing:
 
 def large(paced: Rehearsing, case: str, size: int) -> bytes:
     """A payload whose only field nobody knows."""
-    return framed(paced.program.envelope.numbers[case], tag(30, LEN) + varint(size) + bytes(size))
+    return framed(paced.program.envelopes.numbers[case], tag(30, LEN) + varint(size) + bytes(size))
 
 
 def drives(simulation: Rehearsing, ns: int) -> None:

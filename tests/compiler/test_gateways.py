@@ -451,15 +451,15 @@ def test_what_is_needed_is_asked_of_the_whole_table(tmp_path: Path) -> None:
 def test_a_reload_reads_no_protos_for_it_and_those_of_the_next_table(tmp_path: Path) -> None:
     only = check_file(tmp_path, ONLY).program
     assert only is not None
-    routed = check_file(tmp_path, ONLY + ENVELOPE + LISTEN + ROUTES, known=Definitions(only.protos)).program
+    routed = check_file(tmp_path, ONLY + ENVELOPE + LISTEN + ROUTES, known=Definitions(only.envelopes.schemas)).program
     assert routed is not None
-    assert len(routed.envelope.cases) == 26
-    again = check_file(tmp_path, ONLY, known=Definitions(routed.protos)).program
+    assert len(routed.envelopes.first.cases) == 26
+    again = check_file(tmp_path, ONLY, known=Definitions(routed.envelopes.schemas)).program
     assert again is not None
-    assert not again.envelope.cases
+    assert not again.envelopes.first.cases
 
 
 def test_a_datagram_from_before_the_reload_has_no_payload(tmp_path: Path) -> None:
     program = check_file(tmp_path, ONLY).program
     assert program is not None
-    assert Classifier(program.envelope, program.table).payloads("rover", b"\xca\x01\x02\x08\x01") == []
+    assert Classifier(program.envelopes, program.table).payloads("rover", b"\xca\x01\x02\x08\x01") == []

@@ -57,7 +57,7 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Compile
     for listener in rover_program.listeners:
         for reason in REJECT_REASONS:
             assert Series("datagrams_rejected", (listener.name, reason)) in series
-    for case in (*rover_program.envelope.cases, UNKNOWN_CASE):
+    for case in (*rover_program.envelopes.first.cases, UNKNOWN_CASE):
         assert Series("unhandled", (case,)) in series
     for [plan] in rover_program.inbound.values():
         route = plan.route

@@ -11,6 +11,7 @@ from router.datagrams import Wire
 from router.errors import Located, SourceSpan
 from router.tools.payloads import PayloadModel, pose
 from router.types.protobuf import find_envelope, load_protos
+from router.types.table_envelopes import Envelopes
 from tests.envelopes import LEN, VARINT, framed, tag
 
 PROTOS = Path(__file__).parent
@@ -20,7 +21,7 @@ PROTOS = Path(__file__).parent
 def wire() -> Wire:
     span = SourceSpan("everything")
     schema = load_protos(Located(PROTOS, span), Located("Envelope", span))
-    return Wire(find_envelope(schema, Located("payload", span)))
+    return Wire(Envelopes({"": find_envelope(schema, Located("payload", span))}))
 
 
 def payload(case: str, **fields: object) -> Any:
@@ -45,7 +46,7 @@ def enveloped(case: str, **fields: object) -> bytes:
 
 def usual() -> Mapping[str, bytes]:
     """An envelope of each payload case, with every field."""
-    return {case: enveloped(case) for case in wire().envelope.cases}
+    return {case: enveloped(case) for case in wire().envelopes.first.cases}
 
 
 def odd() -> Mapping[str, bytes]:
@@ -73,6 +74,6 @@ def odd() -> Mapping[str, bytes]:
 
 def unroutable() -> Mapping[str, bytes]:
     """Envelopes whose payload is no message."""
-    made = wire().envelope.message_class
+    made = wire().envelopes.first.message_class
     members: Mapping[str, object] = {"heartbeat": 5, "note": "x", "gear": 1, "ping": {"number": 1}, "real": 0.5}
     return {name: made(**{name: value}).SerializePartialToString() for name, value in members.items()}

@@ -90,7 +90,7 @@ class FakeRunning:
 
     def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
         """`reason`: why no route takes it."""
-        known = Classifier(self.program.envelope, self.program.table)
+        known = Classifier(self.program.envelopes, self.program.table)
         if self.mirror.is_observed:
             self.waiting.append((wall_ns(), listener, peer, known.sender(listener, peer), reason, data))
 

@@ -111,8 +111,8 @@ def client(server: FoxgloveServer) -> Iterator[FoxgloveClient]:
 
 
 def envelope(program: CompiledTable, case: str, **fields: object) -> bytes:
-    payload = program.envelope.cases[case].message_class(**fields)
-    return program.envelope.message_class(**{case: payload}).SerializeToString()
+    payload = program.envelopes.first.cases[case].message_class(**fields)
+    return program.envelopes.first.message_class(**{case: payload}).SerializeToString()
 
 
 def show_until_received(router: Showing, client: FoxgloveClient, case: str) -> None:
@@ -129,7 +129,7 @@ def show_until_received(router: Showing, client: FoxgloveClient, case: str) -> N
 
 
 def test_there_is_a_channel_for_each_payload_case(program: CompiledTable, client: FoxgloveClient) -> None:
-    assert client.channels.keys() == program.envelope.cases.keys()
+    assert client.channels.keys() == program.envelopes.first.cases.keys()
     assert client.info["name"] == "rover_router"
     assert client.info["capabilities"] == []  # a client can look, and nothing else
 
@@ -143,7 +143,9 @@ def test_payloads_come_with_their_arrival_and_are_read_by_the_schema_alone(
     told = client.receive()
     assert (told.topic, told.log_time) == ("imu_info", 1_800_000_000_123_456_789)
     assert told.message.accel_x == 1.5  # type: ignore[attr-defined]
-    assert told.data == program.envelope.cases["imu_info"].message_class(accel_x=1.5, state=2).SerializeToString()
+    assert (
+        told.data == program.envelopes.first.cases["imu_info"].message_class(accel_x=1.5, state=2).SerializeToString()
+    )
     assert told.message.DESCRIPTOR.full_name == client.channels["imu_info"]["schemaName"]
 
 
@@ -151,9 +153,9 @@ def test_every_schema_is_whole_and_only_what_was_subscribed_to_is_sent(
     program: CompiledTable, router: Showing, client: FoxgloveClient
 ) -> None:
     """Schemas of messages in other files are there as well."""
-    client.subscribe(*(case for case in program.envelope.cases if case != "imu_info"))
+    client.subscribe(*(case for case in program.envelopes.first.cases if case != "imu_info"))
     router.wait_for(1)
-    for case in program.envelope.cases:
+    for case in program.envelopes.first.cases:
         router.show(envelope(program, "imu_info"), envelope(program, case))
         assert case == "imu_info" or client.receive().topic == case
 

@@ -48,8 +48,8 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> CompiledTable:
 
 
 def drive_diag(program: CompiledTable, **fields: object) -> Evidence:
-    case = program.envelope.cases["drive_diag"]
-    return Evidence(ROUTE, BOARD, Wire(program.envelope).encode(case, case.message_class(**fields)))
+    case = program.envelopes.first.cases["drive_diag"]
+    return Evidence(ROUTE, BOARD, Wire(program.envelopes).encode(case, case.message_class(**fields)))
 
 
 MOTORS = {f"{end}_{side}_motor": {"rpm": 0.5} for end in ("front", "back") for side in ("left", "right")}

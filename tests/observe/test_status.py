@@ -47,7 +47,7 @@ def value(shown: Status, case: str) -> Any:
 
 
 def imu(**fields: Any) -> bytes:
-    return PROGRAM.envelope.message_class(imu_info=fields).SerializeToString()
+    return PROGRAM.envelopes.first.message_class(imu_info=fields).SerializeToString()
 
 
 @pytest.mark.parametrize(

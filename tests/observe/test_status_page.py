@@ -519,7 +519,7 @@ def test_a_case_shows_its_numbers_and_its_last_value(running: FakeRunning, page:
     running.count("messages_received", "imu_info", "sensor_board", to=1234)
     running.count("messages_filtered", "imu_info", "imu_data", to=34)
     choose(page, "case:imu_info")
-    data = running.program.envelope.message_class(imu_info={"accel_x": 1.5}).SerializeToString()
+    data = running.program.envelopes.first.message_class(imu_info={"accel_x": 1.5}).SerializeToString()
     running.receive(data, BOARD)
     page.until("document.querySelector('#value')?.textContent.includes('accel_x: 1.5')")
     page.until("document.querySelector('#facts').textContent.includes('1\\u202f234')")
@@ -580,7 +580,7 @@ def test_texts_of_payloads_and_names_are_text_and_nothing_else(
             choose(page, f"case:{case}")
             assert "None received" in page.text("#facts")
             hostile.receive(
-                hostile.program.envelope.message_class(**{case: note}).SerializeToString(), ("127.0.0.2", 8)
+                hostile.program.envelopes.first.message_class(**{case: note}).SerializeToString(), ("127.0.0.2", 8)
             )
             page.until("document.querySelector('#value') !== null")
             shown = page.text("#value")

@@ -35,7 +35,7 @@ BOARD, STATION, STRANGER = ("127.0.0.30", 25008), ("127.0.0.10", 29000), ("127.0
 
 def datagram(case: str) -> bytes:
     """With an empty payload."""
-    return PROGRAM.envelope.message_class(**{case: {}}).SerializeToString()
+    return PROGRAM.envelopes.first.message_class(**{case: {}}).SerializeToString()
 
 
 IMU, GPS = datagram("imu_info"), datagram("gps_info")

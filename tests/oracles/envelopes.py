@@ -31,7 +31,7 @@ class Decision:
     superseded: int = 0
 
 
-def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, repairs: bool) -> Decision:
+def decide(envelope: Envelope, routed: Container[str], data: bytes, most: int, repairs: bool) -> Decision:
     """The decision about `data`, of at most `most` bytes. `routed` are the payload cases with a route."""
     if len(data) > most:
         return Decision("truncated", 0, False)
@@ -65,7 +65,7 @@ def decide(envelope: Envelope, routed: Container[int], data: bytes, most: int, r
 
 
 def _decide_by_name(
-    envelope: Envelope, by: ByName, routed: Container[int], parsed: Message, whole: bytes, is_repaired: bool
+    envelope: Envelope, by: ByName, routed: Container[str], parsed: Message, whole: bytes, is_repaired: bool
 ) -> Decision:
     unknown = UnknownFieldSet(parsed)
     numbers = {unknown[index].field_number for index in range(len(unknown))}
@@ -82,7 +82,7 @@ def _decide_by_name(
     if by.data[1] in numbers and not data:
         return Decision("malformed", by.data[1], is_repaired)
     try:
-        if case.number in routed:
+        if case.name in routed:
             case.message_class.FromString(data)
     except DecodeError:
         return Decision("malformed", 0, is_repaired)
@@ -130,7 +130,7 @@ def _members(envelope: Envelope, whole: bytes) -> list[int]:
     return [number for (number, _), _ in groupby(payloads)]
 
 
-def _only_payload(envelope: Envelope, routed: Container[int], data: bytes) -> int | None:
+def _only_payload(envelope: Envelope, routed: Container[str], data: bytes) -> int | None:
     """The routed payload case that is an envelope's only field and that protobuf parses separately.
 
     Its nesting may be one level deeper than protobuf allows within an envelope.
@@ -138,7 +138,7 @@ def _only_payload(envelope: Envelope, routed: Container[int], data: bytes) -> in
     tag, at = _short_varint(data, 0)
     size, at = _short_varint(data, at)
     case = next((case for case in envelope.cases.values() if case.number << 3 | 2 == tag), None)
-    if case is None or case.number not in routed or at + size != len(data):
+    if case is None or case.name not in routed or at + size != len(data):
         return None
     try:
         case.message_class.FromString(data[at:])

@@ -52,7 +52,7 @@ def datagrams(draw: st.DrawFn) -> bytes:
     kind = draw(st.sampled_from(["bytes", "payload", "cut", "changed", "padded", "long length"]))
     if kind == "bytes":
         return draw(st.binary(max_size=300))
-    case = draw(st.sampled_from(list(wire().envelope.cases.values())))
+    case = draw(st.sampled_from(list(wire().envelopes.first.cases.values())))
     if kind == "long length":
         return bytes([case.number << 3 & 0x7F | 2, 0x80, 0]) if case.number < 16 else b"\x82\x01\x80\x00"
     exact = wire().encode(case, case.message_class())
@@ -87,7 +87,7 @@ def table(**changed: Any) -> RouteTable:
 
 @cache
 def classifier() -> Classifier:
-    return Classifier(wire().envelope, table())
+    return Classifier(wire().envelopes, table())
 
 
 def shown(
@@ -156,7 +156,7 @@ class FakeMirror:
 
     def __init__(self) -> None:
         self.keeper: Keeper = print
-        self.program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
+        self.program = SimpleNamespace(table=table(), envelopes=wire().envelopes, protos_sha256="0" * 64)
 
     def keep(self, keeper: Keeper) -> Callable[[], None]:
         self.keeper = keeper

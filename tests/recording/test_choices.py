@@ -16,6 +16,7 @@ from router.recording.encoder import Packer
 from router.recording.mirror import SENT, Action, Classifier
 from router.recording.reader import Recorded, RecordedAction, Recording
 from router.recording.schemas import recorded_envelope
+from router.types.table_envelopes import Envelopes
 from tests.recording.recorder_rig import START, Listed, shown, write
 
 TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
@@ -49,15 +50,15 @@ def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tm
     made = program(table)
     batch = [shown(data, START + number) for number, data in enumerate(datagrams)]
     sent = [Action(START, SENT, "route", "board", data=datagrams[0])]
-    classifier = Classifier(made.envelope, made.table)
+    classifier = Classifier(made.envelopes, made.table)
     packed = Packer().pack(Listed(batch), Listed(sent), classifier, START, 0)
     path = write(tmp_path / "it.mcap", Channels(), packed)
     with closing(Recording(path)) as recording:
-        found = Wire(recorded_envelope(recording.cases()))
+        found = Wire(Envelopes({"": recorded_envelope(recording.cases())}))
         records = list(recording.everything())
     assert [record.data for record in records if isinstance(record, Recorded)] == datagrams
     assert [record.action.data for record in records if isinstance(record, RecordedAction)] == [datagrams[0]]
-    own = Wire(made.envelope)
+    own = Wire(made.envelopes)
     for data in datagrams:
         for now, before in zip(found.decode_all(data), own.decode_all(data), strict=True):
             assert now.case.name == before.case.name
@@ -66,7 +67,7 @@ def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tm
 
 def test_viewers_get_each_message_of_a_datagram(tmp_path: Path) -> None:
     made = program("vision.yaml")
-    classifier = Classifier(made.envelope, made.table)
+    classifier = Classifier(made.envelopes, made.table)
     packed = Packer().pack(Listed([shown(SHARED[1], START)]), Listed(list[Action]()), classifier, START, 0)
     path = write(tmp_path / "it.mcap", Channels(), packed)
     with path.open("rb") as file:

@@ -18,10 +18,10 @@ from tests.recording.recorder_rig import classifier, datagrams
 from tests.tables import ROUTES
 
 PROGRAM = sim_program()
-KNOWN = Classifier(PROGRAM.envelope, PROGRAM.table)
-NUMBERS = frozenset(PROGRAM.envelope.numbers.values())
+KNOWN = Classifier(PROGRAM.envelopes, PROGRAM.table)
+NUMBERS = frozenset(PROGRAM.envelopes.first.numbers.values())
 VALUES = {VARINT: b"\xff\x01", I64: bytes(8), I32: bytes(4), LEN: b"\x02ab"}
-BRAKE = PROGRAM.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+BRAKE = PROGRAM.envelopes.first.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
 def case_in(data: bytes, known: Classifier = KNOWN, listener: str = "rover") -> str | None:
@@ -29,9 +29,9 @@ def case_in(data: bytes, known: Classifier = KNOWN, listener: str = "rover") -> 
     return found[0][0].name if found else None
 
 
-@pytest.mark.parametrize("case", PROGRAM.envelope.cases.values(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", PROGRAM.envelopes.first.cases.values(), ids=lambda case: case.name)
 def test_the_case_is_found_without_parsing(case: PayloadCase) -> None:
-    data = PROGRAM.envelope.message_class(**{case.name: {}}).SerializeToString()
+    data = PROGRAM.envelopes.first.message_class(**{case.name: {}}).SerializeToString()
     assert ByOneof("payload").numbers_in(data, NUMBERS) == [case.number]
     assert KNOWN.payloads("rover", data) == [(case, case.message_class())]
 
@@ -75,7 +75,7 @@ def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None
     table.write_text(f"version: 1\nextends: {ROUTES}/sim.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
     program = check_table(table).program
     assert program is not None
-    exact = Classifier(program.envelope, program.table)
+    exact = Classifier(program.envelopes, program.table)
     padded = BRAKE + bytes(5)
     assert [case_in(padded), case_in(padded, exact), case_in(BRAKE, exact)] == ["manual_brake", None, "manual_brake"]
     assert case_in(padded, listener="another") is None
@@ -95,6 +95,6 @@ def test_a_sender_is_called_what_the_listener_takes_it_for(tmp_path: Path) -> No
     )
     program = check_table(table).program
     assert program is not None
-    known, station = Classifier(program.envelope, program.table), ("127.0.0.10", 29000)
+    known, station = Classifier(program.envelopes, program.table), ("127.0.0.10", 29000)
     assert [known.sender(listener, station) for listener in ("rover", "radio", "gone")] == ["", "basestation", ""]
     assert known.sender("rover", ("127.0.0.30", 25008)) == "sensor_board"

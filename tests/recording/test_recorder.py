@@ -440,7 +440,7 @@ def test_where_the_directory_is_removed_it_is_made_again(tmp_path: Path) -> None
 def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path) -> None:
     with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
         mirror.show(now(imu(1)))
-        mirror.program = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
+        mirror.program = SimpleNamespace(table=table(endpoints={}), envelopes=wire().envelopes, protos_sha256="1" * 64)
         mirror.show([each._replace(endpoint="", reason="source_mismatch") for each in now(imu(2))])
         saved = made.save("http")
     assert [(each.endpoint, each.reason) for each in read(saved)] == [("sensor_board", ""), ("", "source_mismatch")]

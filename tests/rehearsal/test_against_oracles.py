@@ -246,9 +246,9 @@ DEFINITIONS = Definitions()
 
 
 def envelope(case: str, **payload: object) -> bytes:
-    schema = checked(SETTINGS[0]).envelope
-    assert schema is not None
-    data: bytes = schema.message_class(**{case: payload}).SerializeToString()
+    envelopes = checked(SETTINGS[0]).envelopes
+    assert envelopes is not None
+    data: bytes = envelopes.first.message_class(**{case: payload}).SerializeToString()
     return data
 
 

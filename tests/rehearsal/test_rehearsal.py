@@ -109,7 +109,7 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
         path.write_text(TABLE.format(protos=PROTOS, listen=listen, **ports))
         made = check_table(path).program
         assert made is not None
-        given = mixed(Wire(made.envelope), 200)
+        given = mixed(Wire(made.envelopes), 200)
         run = Rehearsal(made)
         for data in given:
             run.datagram("rover", board.getsockname(), data)

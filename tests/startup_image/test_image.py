@@ -113,7 +113,7 @@ def test_an_image_is_the_same_in_every_process(tmp_path: Path) -> None:
 
 
 _RECEIVED = "datagrams_received"
-BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+BRAKE = WIRE.envelopes.first.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
 @dataclass
@@ -130,7 +130,7 @@ def test_a_head_start_receives_sends_and_counts_as_the_program_of_its_image(tmp_
     checked = check_table(path)
     assert checked.program, "\n".join(map(str, checked.diagnostics))
     datagrams = [
-        *(form for case in WIRE.envelope.cases.values() for form in sample(case.name, _filled(case)).variants),
+        *(form for case in WIRE.envelopes.first.cases.values() for form in sample(case.name, _filled(case)).variants),
         *(b"", b"\xff", FRAME * b"\x0a"),
     ]
     every = [(source, listener, each) for each in datagrams for source in SOURCES for listener in LISTENERS]
@@ -186,7 +186,7 @@ def test_a_router_takes_over_all_that_a_head_start_has_opened(tmp_path: Path) ->
         assert running
         assert running._opened == opened
         assert router.reload().ok
-        datagram = sample("ph_info", _filled(WIRE.envelope.cases["ph_info"])).datagram
+        datagram = sample("ph_info", _filled(WIRE.envelopes.first.cases["ph_info"])).datagram
         with udp(SOURCES["basestation"], ports["basestation"]) as basestation:
             tool.sendto(datagram, (LISTENERS["exact"], ports["exact"]))
             assert basestation.recv(2000) == datagram

@@ -137,16 +137,14 @@ def test_fields_are_flattened_to_paths_with_a_place_for_each_part(table: RouteTa
 
 def test_protos_are_the_routers_own_unless_the_table_has_some(tmp_path: Path) -> None:
     text = GOOD.replace("protos: ../protos, ", "")
-    envelope = good(tmp_path, text).envelope
-    assert envelope is not None
+    envelope = good(tmp_path, text).envelopes[""]
     assert envelope.protos.value == asset("protos")
 
 
 def test_protos_are_relative_to_the_file_that_says_so(tmp_path: Path) -> None:
     (tmp_path / "base").mkdir()
     (tmp_path / "base" / "base.yaml").write_text(GOOD)
-    envelope = good(tmp_path, "extends: base/base.yaml\n").envelope
-    assert envelope
+    envelope = good(tmp_path, "extends: base/base.yaml\n").envelopes[""]
     assert envelope.protos.value.resolve() == tmp_path / "protos"
 
 

@@ -145,7 +145,7 @@ def test_frames_are_counted_when_their_last_part_comes_or_it_is_too_late() -> No
 
 
 def test_parts_are_known_by_their_fields() -> None:
-    cases = wire_of_protos(PROTOS).envelope.cases
+    cases = wire_of_protos(PROTOS).envelopes.first.cases
     assert [name for name, case in cases.items() if is_part(case.type)] == ["detected_object"]
 
 

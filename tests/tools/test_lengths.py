@@ -59,8 +59,8 @@ def test_lists_have_the_length_that_mappings_need(
     (tmp_path / "table.yaml").write_text(TABLE.format(type=type_, fields=fields, when=when))
     checked = check_table(tmp_path / "table.yaml", {})
     assert [each for each in checked.diagnostics if each.severity is Severity.ERROR] == []
-    assert checked.envelope is not None
-    case = checked.envelope.cases["power"]
+    assert checked.envelopes is not None
+    case = checked.envelopes.first.cases["power"]
     message: Any = case.message_class()
     PayloadModel(case.name, case.type, 1, needed_lengths(checked.routes)).fill(message, pose(1.0, 0.0))
     cell = message.pack.cells[0]

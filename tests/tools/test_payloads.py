@@ -42,7 +42,7 @@ def sequence(case: PayloadCase, seed: int, times: tuple[float, ...] = (0.0, 0.5,
 
 
 def test_the_same_seed_gives_the_same_values_and_another_others(rover: Wire) -> None:
-    for case in rover.envelope.cases.values():
+    for case in rover.envelopes.first.cases.values():
         assert sequence(case, seed=7) == sequence(case, seed=7)
     assert sequence(rover.case("imu_info"), seed=1) != sequence(rover.case("imu_info"), seed=2)
 
@@ -58,7 +58,7 @@ def test_every_field_of_a_case_without_a_model_is_filled(every_kind: PayloadCase
 
 
 def test_well_known_types_have_values_with_a_json_form() -> None:
-    for case in everything.wire().envelope.cases.values():
+    for case in everything.wire().envelopes.first.cases.values():
         for message in sequence(case, seed=1, times=(0.0, 1.25, 59.9999999999)):
             MessageToDict(message)
     at = sequence(everything.wire().case("known"), seed=1, times=(1.25,))[0]
@@ -66,9 +66,9 @@ def test_well_known_types_have_values_with_a_json_form() -> None:
 
 
 def test_payloads_fit_the_envelope_that_boards_take(rover: Wire) -> None:
-    for case in rover.envelope.cases.values():
+    for case in rover.envelopes.first.cases.values():
         for message in sequence(case, seed=3):
-            assert len(rover.encode(case, message)) <= rover.envelope.max_size
+            assert len(rover.encode(case, message)) <= rover.envelopes.first.max_size
 
 
 def test_an_imu_at_rest_feels_gravity_alone(rover: Wire) -> None:

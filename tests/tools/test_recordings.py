@@ -154,7 +154,7 @@ def test_a_recording_that_is_slow_to_open_does_not_hurry_what_comes_first(
 
 
 def recording(path: Path) -> TapRecording:
-    return TapRecording(path, wire().envelope, rig_table())
+    return TapRecording(path, wire().envelopes, rig_table())
 
 
 def test_what_the_tap_shows_is_in_the_file_and_what_it_lost_is_counted(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
 from router.tools.sim_view import SimView
 from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_obedience, parse_silence, streams
 from router.tools.udp import LOOPBACK, open_udp, reachable
+from router.types.table_envelopes import Envelopes
 from tests.compiler.payloads import wire_of
 from tests.ports import free_port
 from tests.rehearsal.test_tables import TABLES
@@ -246,7 +247,7 @@ def test_a_silence_covers_an_endpoint_or_a_case_from_its_start_until_before_its_
 def some_statistics(wire: Wire) -> Statistics:
     statistics = Statistics()
     board = Board("board", {"plain"}, [], statistics.changes.append)
-    statistics.inboxes = {"station": Inbox(wire, None), "board": Inbox(wire, board)}
+    statistics.inboxes = {"station": Inbox(wire, "station", None), "board": Inbox(wire, "board", board)}
     statistics.sent["board"]["every_kind"] = 7
     message = wire.case("every_kind").message_class(i32=5)
     statistics.inboxes["station"].arrivals["every_kind"] = Arrivals(message, at=1.5, count=4)
@@ -348,7 +349,7 @@ def test_what_order_compares_grows_from_message_to_message(tmp_path: Path) -> No
     for name, host in (("ROVER", "127.0.6.1"), ("BOARD", "127.0.6.30"), ("BASE", "127.0.6.10")):
         text = text.replace(name, str(free_port(host)))
     path.write_text(text)
-    table, frames = read_table(path), Wire(wire_of(TABLES / "beside", "Frame")[1])
+    table, frames = read_table(path), Wire(Envelopes({"": wire_of(TABLES / "beside", "Frame")[1]}))
     reads: dict[str, Callable[[Any], int]] = {
         "speed": lambda frame: frame.header.seq,
         "labelled": lambda frame: frame.labelled.envelope,
@@ -358,13 +359,13 @@ def test_what_order_compares_grows_from_message_to_message(tmp_path: Path) -> No
     assert made.pop("part") is None
     for name, numbered in made.items():
         assert numbered is not None
-        frame: Any = frames.envelope.message_class()
+        frame: Any = frames.envelopes.first.message_class()
         for number, expected in ((7, 7), (numbered.type.high + 1, 0)):
             numbered.set(frame if numbered.is_beside else getattr(frame, name), number)
             assert reads[name](frame) == expected
     with played(frames, table) as (simulator, router):
         simulate(simulator, lambda: all(sum(sent.values()) > 5 for sent in simulator.statistics.sent.values()))
-        found = [frames.envelope.message_class.FromString(router.recv(2000)) for _ in range(12)]
+        found = [frames.envelopes.first.message_class.FromString(router.recv(2000)) for _ in range(12)]
     for name, read in reads.items():
         counted = [read(frame) for frame in found if frame.WhichOneof("payload") == name]
         assert counted == [*range(1, len(counted) + 1)]

@@ -42,7 +42,7 @@ def test_repairs_are_told(wire: Wire) -> None:
 def test_each_message_of_a_datagram_has_a_line() -> None:
     program = check_table(TABLES / "vision.yaml", {}).program
     assert program is not None
-    told = tapped_datagram(0, "camera", b"\x3a\x02\x08\x09\x12\x02\x08\x05", Wire(program.envelope))
+    told = tapped_datagram(0, "camera", b"\x3a\x02\x08\x09\x12\x02\x08\x05", Wire(program.envelopes))
     assert [each.line(with_hex=False).split(" ", 1)[1] for each in told] == [
         "camera detection frame=5",
         "camera geometry length=9",
@@ -112,7 +112,7 @@ def test_datagrams_are_heard_in_order(wire: Wire) -> None:
     with open_udp(Address("127.0.0.1", 0), "tap") as tap, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
         for data in (b"\x12\x00", b"", b"\x0a\x00"):
             board.sendto(data, tap.getsockname())
-        hearing = listen(tap, wire, lambda peer: f"port {peer[1]}")
+        hearing = listen(tap, wire, wire.envelopes.first, lambda peer: f"port {peer[1]}")
         [first], [second], [third] = next(hearing), next(hearing), next(hearing)
     assert first.decoded is not None
     assert third.decoded is not None
@@ -120,12 +120,12 @@ def test_datagrams_are_heard_in_order(wire: Wire) -> None:
     assert first.peer.startswith("port ")
 
 
-ENVELOPE = sim_program().envelope
+ENVELOPE = sim_program().envelopes.first
 CASES = ENVELOPE.cases
 
 
 def holds(text: str, case: str, source: str = "sensor_board", **fields: object) -> bool:
-    return Condition(text, ENVELOPE, [CASES[case]]).holds(case, CASES[case].message_class(**fields), source, 0)
+    return Condition(text, [CASES[case]]).holds(case, CASES[case].message_class(**fields), source, 0)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_condition_is_an_expression_over_the_payload(text: str, is_true: bool)
 
 
 def test_cases_without_the_field_are_left_out() -> None:
-    condition = Condition("satellites < 4", ENVELOPE, list(CASES.values()))
+    condition = Condition("satellites < 4", list(CASES.values()))
     assert condition.cases == {"gps_info"}
     assert not condition.holds("imu_info", CASES["imu_info"].message_class(), "sensor_board", 0)
 
@@ -165,11 +165,11 @@ def test_cases_without_the_field_are_left_out() -> None:
 )
 def test_what_is_no_condition_is_refused(text: str, complaint: str) -> None:
     with pytest.raises(UsageError) as refused:
-        Condition(text, ENVELOPE, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
+        Condition(text, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
     assert str(refused.value).startswith(complaint)
 
 
 def test_where_it_cannot_be_computed_it_does_not_hold_and_is_remembered() -> None:
-    condition = Condition("altitude / speed > 1", ENVELOPE, [CASES["gps_info"]])
+    condition = Condition("altitude / speed > 1", [CASES["gps_info"]])
     assert not condition.holds("gps_info", CASES["gps_info"].message_class(), "sensor_board", 0)
     assert condition.failure.startswith("gps_info: ")

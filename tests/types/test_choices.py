@@ -107,9 +107,9 @@ def test_each_message_is_a_case_and_parts_of_others_need_no_route(
 def test_what_is_wrong_is_said(folder: Path, data: bytes, why: str) -> None:
     (folder / "protos" / "b.proto").write_text(WRAPPED)
     write_table(folder, NAMED, "Referee")
-    envelope = check_table(folder / "table.yaml", {}).envelope
-    assert envelope is not None
-    said, _, _ = why_rejected(envelope, data, len(data), repairs=True).partition("; ")  # guesses follow
+    envelopes = check_table(folder / "table.yaml", {}).envelopes
+    assert envelopes is not None
+    said, _, _ = why_rejected(envelopes.first, data, len(data), repairs=True).partition("; ")  # guesses follow
     assert said == why
 
 

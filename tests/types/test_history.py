@@ -52,7 +52,7 @@ class Protos:
             schema = load_protos(*named)
         except TableError as error:
             return [str(finding) for finding in error.diagnostics]
-        found = [*LockComparison(schema, find_envelope(schema, ONEOF)).findings(), *schema.warnings]
+        found = [*LockComparison(find_envelope(schema, ONEOF)).findings(), *schema.warnings]
         return [str(finding) for finding in found if "takes up to" not in finding.message]
 
     def lock(self, *accepted: str) -> int:

@@ -48,7 +48,7 @@ def compare(write: Write) -> Compare:
     def comparison(texts: str | Mapping[str, str], message: str = "Envelope") -> LockComparison:
         root = write({"motor.proto": texts} if isinstance(texts, str) else texts)
         schema = load_protos(*settings(root, message))
-        return LockComparison(schema, find_envelope(schema, ONEOF))
+        return LockComparison(find_envelope(schema, ONEOF))
 
     return comparison
 

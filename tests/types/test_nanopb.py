@@ -139,7 +139,7 @@ def test_a_copy_of_nanopb_proto_in_the_folder_is_used_and_neither_locked_nor_lis
     own = asset("schemas/nanopb.proto").read_text().replace("optional bool discard_deprecated", "// ")
     root = write({"nanopb.proto": own, "e.proto": IMPORT + ENVELOPE})
     schema = load_protos(*settings(root))
-    lock = LockComparison(schema, find_envelope(schema, ONEOF)).extended()
+    lock = LockComparison(find_envelope(schema, ONEOF)).extended()
     assert schema.files == ("e.proto",)
     assert sorted([*lock.messages, *lock.enums]) == ["A", "Envelope"]
     assert board_options(schema, "A.x").max_size == 8
@@ -148,7 +148,7 @@ def test_a_copy_of_nanopb_proto_in_the_folder_is_used_and_neither_locked_nor_lis
 def test_nanopb_proto_need_not_be_in_the_folder(write: Write) -> None:
     root = write({"protos/e.proto": IMPORT + ENVELOPE, "nanopb.proto": "something else"}) / "protos"
     schema = load_protos(*settings(root))
-    lock = LockComparison(schema, find_envelope(schema, ONEOF)).extended()
+    lock = LockComparison(find_envelope(schema, ONEOF)).extended()
     assert sorted([*lock.messages, *lock.enums]) == ["A", "Envelope"]
     assert board_options(schema, "A.x").max_size == 8
 

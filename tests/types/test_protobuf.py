@@ -244,8 +244,8 @@ def test_protos_are_read_again_once_something_else_is_excluded(write: Write) -> 
     protos, message, *_ = settings(write({"a.proto": ENVELOPE, "b.proto": "message B {}"}))
     whole = EnvelopeSettings(protos, message, ONEOF)
     known = Definitions().protos(whole)
-    assert Definitions(known).protos(whole) is known
-    assert Definitions(known).protos(replace(whole, exclude=excluding("b.proto"))).warnings == ()
+    assert Definitions([known]).protos(whole) is known
+    assert Definitions([known]).protos(replace(whole, exclude=excluding("b.proto"))).warnings == ()
 
 
 def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: Write) -> None:

@@ -24,6 +24,7 @@ from router.compiler.lowering.names import TooLargeError
 from router.compiler.lowering.sources import Datagram, RosMessage
 from router.errors import Diagnostic
 from router.types.protobuf import Envelope, PayloadCase
+from router.types.table_envelopes import Envelopes
 
 __all__ = [
     "Lowered",
@@ -52,7 +53,7 @@ _NO_STATES: Mapping[str, CheckedState] = {}
 
 
 def lower_table(
-    routes: Sequence[CheckedRoute], envelope: Envelope | None = None, states: Mapping[str, CheckedState] = _NO_STATES
+    routes: Sequence[CheckedRoute], envelopes: Envelopes | None = None, states: Mapping[str, CheckedState] = _NO_STATES
 ) -> tuple[Lowered, list[Diagnostic]]:
     """Lower all targets and states of a table without errors. Return findings for those that are too large."""
     names = tuple(states)
@@ -68,7 +69,7 @@ def lower_table(
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             with _limits_in(findings):
                 if targets:
-                    source = Datagram(checked.case, envelope, names)
+                    source = Datagram(checked.case, _holder(envelopes, checked.case), names)
                     lowered[checked.route.name] = source.lowered(checked, targets)
         for feed in checked.subscriptions:
             topic = feed.topic.topic.value
@@ -77,19 +78,20 @@ def lower_table(
                 from_ros[topic] = (*from_ros.get(topic, ()), message.lowered(checked, feed))
         with _limits_in(findings):
             if checked.order is not None:
-                order[checked.route.name] = Datagram(checked.case, envelope).ordered(checked.order)
+                source = Datagram(checked.case, _holder(envelopes, checked.case))
+                order[checked.route.name] = source.ordered(checked.order)
         with _limits_in(findings):
             if checked.obeyed is not None:
                 when, case = checked.obeyed.when, checked.obeyed.case
-                obeyed[checked.route.name] = lower_condition(when, case, envelope, is_bounded=True)
-    values = _lower_states(states, envelope, findings)
+                obeyed[checked.route.name] = lower_condition(when, case, _holder(envelopes, case), is_bounded=True)
+    values = _lower_states(states, envelopes, findings)
     for topic, of_state in _feeds(states, values):
         from_ros[topic] = (*from_ros.get(topic, ()), of_state)
     return Lowered(to_destinations, to_topics, from_ros, order, obeyed, values), findings
 
 
 def _lower_states(
-    states: Mapping[str, CheckedState], envelope: Envelope | None, findings: list[Diagnostic]
+    states: Mapping[str, CheckedState], envelopes: Envelopes | None, findings: list[Diagnostic]
 ) -> Mapping[str, LoweredState]:
     lowered = {}
     for name, state in states.items():
@@ -97,8 +99,12 @@ def _lower_states(
             if state.feed is not None:
                 lowered[name] = RosMessage(state.feed.type, state.feed.topic.topic.value).state(state, state.feed)
             elif state.case is not None:
-                lowered[name] = Datagram(state.case, envelope).state(state)
+                lowered[name] = Datagram(state.case, _holder(envelopes, state.case)).state(state)
     return lowered
+
+
+def _holder(envelopes: Envelopes | None, case: PayloadCase) -> Envelope | None:
+    return envelopes.of(case.name) if envelopes is not None else None
 
 
 def _feeds(

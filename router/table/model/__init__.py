@@ -37,14 +37,15 @@ class RouteTable:
     """A table after `extends` and variables. `files` are all files read, the table itself first.
 
     `routes_span` is the key `routes`; a table with only gateways has none and needs no envelope. `sha256` is over the
-    bytes of `files` in order. `broken` names parts with findings, such as `endpoints/arm_board`, which were left out,
-    so that their absence is not reported again. The valid rest of a broken route may still be in `routes`.
+    bytes of `files` in order. `envelopes` are by name; the key `envelope` is one with the name "". `broken` names
+    parts with findings, such as `endpoints/arm_board`, which were left out, so that their absence is not reported
+    again. The valid rest of a broken route may still be in `routes`.
     """
 
     path: Path
     files: tuple[Path, ...]
     sha256: str
-    envelope: EnvelopeSettings | None
+    envelopes: Mapping[str, EnvelopeSettings]
     node: NodeSettings
     http: ServerSettings | None
     listeners: Mapping[str, Listener]
@@ -70,3 +71,8 @@ class RouteTable:
     def lines(self) -> tuple[Listener, ...]:
         """The listeners that are serial lines."""
         return tuple(listener for listener in self.listeners.values() if listener.line is not None)
+
+    @property
+    def envelope_names(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """The name of the envelope of each listener, and of each endpoint."""
+        return dict.fromkeys(self.listeners, ""), dict.fromkeys(self.endpoints, "")

@@ -42,12 +42,12 @@ def build(folder: Path, name: str = "envelope_fuzz", compile_: Compile = for_lib
     for index, schema in enumerate(SCHEMAS):
         made = table(schema, folder)
         memory = Arrays()
-        lowered = write_schema(made.envelope, made.inbound, memory)
+        lowered = write_schema(made.envelopes.first, made.inbound, memory)
         declarations += _arrays(index, lowered)
         names = f"names_{index}" if lowered.name_count else "NULL"
         numbers = lowered.case_by, names, lowered.name_count, lowered.name_field, lowered.payload_field
         kinds.append(", ".join(map(str, numbers)))
-        maker = maker_for(made.envelope, noise)
+        maker = maker_for(made.envelopes.first, noise)
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
         if schema == "rover":
             seeds += [bytes.fromhex(each["hex"]) for each in json.loads(GOLDEN.read_text())]

@@ -100,9 +100,8 @@ def lowered_programs() -> Iterator[Fuzzed]:
     for table in (ROUTES / "rover.yaml", ROUTES / "legacy.yaml", BENCHMARKS / "own.yaml"):
         made = check_table(table, {}).program
         assert made is not None, table
-        makers = {name: _seeds_of(made.envelope, name, noise) for name in made.envelope.cases}
-        numbers = made.envelope.numbers.items()
-        by_route = {handler.route: name for name, number in numbers for handler in made.inbound.get(number, ())}
+        makers = {name: _seeds_of(made.envelopes.first, name, noise) for name in made.envelopes.first.cases}
+        by_route = {handler.route: name for name, handlers in made.inbound.items() for handler in handlers}
         yield from _of(made.lowered, lambda route: makers[by_route[route]], noise)  # noqa: B023 - used at once
     schema, envelope = made_wire()
     for name, fields, target, when in TO_ROS:
