@@ -29,6 +29,9 @@ from router.cli.tool_options import (
 from router.errors import StartError, TransportError, UsageError
 
 if TYPE_CHECKING:
+    from router.datagrams import Wire
+    from router.table.model import RouteTable
+    from router.table.model.endpoints import Listener
     from router.tools.gateway_client import Received
 
 FORMATS = ("gateway_v1", "json_lines")
@@ -54,7 +57,8 @@ _PLACES = """places:
                         listen=LOCATOR and mode=peer|client|router; or
                         ?config=FILE of Zenoh, for example for TLS
   envelope://[HOST:]PORT    envelopes, as boards and basestation get them
-  envelope://NAME       the same at the address of an endpoint or listener
+  envelope://NAME       the same at the address of an endpoint or listener; for
+                        the board of a serial line, at a pty in its place
   topic://NAME          a ROS topic"""
 _EXAMPLES = (
     "router listen udp://8502 --ask 127.0.0.1:8500",
@@ -135,10 +139,13 @@ def _listen_to_gateway(args: argparse.Namespace) -> None:
 
 
 def _listen_to_port(place: str, args: argparse.Namespace) -> None:
-    from router.tools import udp
+    from router.tools import links, udp
     from router.tools.tap import listen
 
     wire, table = load_wire(args, place)
+    if table is not None and (line := links.line_of(place, table)) is not None:
+        _listen_to_line(line, table, wire, args, is_board=place != line.name)
+        return
     address = udp.listening(place, table)
     envelope = wire.envelopes.first if table is None else udp.received_at(address, table, wire.envelopes)
     with udp.open_udp(address, place, udp.endpoint_of(place, table)) as receiver:
@@ -146,6 +153,17 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
         say(f"listening on {host}:{port}; press Ctrl-C to stop")
         with until_interrupted():
             print_batches(listen(receiver, wire, envelope, udp.peer_names(table)), args)
+
+
+def _listen_to_line(line: Listener, table: RouteTable, wire: Wire, args: argparse.Namespace, *, is_board: bool) -> None:
+    from router.tools import links
+
+    with closing(links.end_of(line, is_board=is_board)) as end:
+        what = f"at {end.device}, a pty that the router can open" if is_board else f"to {end.device}"
+        say(f"listening {what}; press Ctrl-C to stop")
+        peer = line.name if is_board else links.board_at(line, table)
+        with until_interrupted():
+            print_batches(links.listen(end, peer, wire, wire.envelopes.at(line.name)), args)
 
 
 def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb, with_help
 from router.cli.completion import cases, completes, endpoints, fields, places
-from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, until_interrupted, whole
+from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, say, until_interrupted, whole
+from router.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from router.datagrams import Wire
     from router.table.addresses import Address
     from router.table.model import RouteTable
+    from router.table.model.endpoints import Listener
     from router.tools.udp import Sent
 
 _EXAMPLES = (
@@ -27,7 +30,8 @@ _EXAMPLES = (
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    description = "Build a payload from field=value words and send it in an envelope."
+    description = """Build a payload from field=value words and send it in an envelope. To the listener of a serial
+line, send it as the board: at a pty, when the router has opened it; to the board, at the line's device."""
     parser = add_verb(subparsers, "send", description, *_EXAMPLES)
     completes(parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info"), cases)
     completes(
@@ -55,23 +59,42 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from router.datagrams import framed
-    from router.tools import udp
+    from router.tools import links, udp
     from router.tools.udp import Sent, send
 
     wire, table = load_wire(args, args.to)
     exact = _envelope(wire, args.case, args.fields)
     data = framed(exact, args.trim, args.pad)
+    count = args.count if args.count is not None else None if args.rate else 1
+    if table is not None and (line := links.line_of(args.to, table)) is not None:
+        return _send_frames(args, line, table, data, count)
     to = udp.destination(args.to, table)
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
-    count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
     # Without --count, Ctrl-C stops sending; the summary is printed all the same.
     with udp.open_udp(origin, "--from") as sender, until_interrupted():
         if (endpoint := udp.endpoint_of(args.to, table)) is not None:
             udp.aim(sender, endpoint)
         send(sender, to, data, count, args.rate, sent)
-    print(_summary(args.case, data, to, sent))
+    print(_summary(args.case, data, str(to), sent))
     return _advise(args, table, to, sent)
+
+
+def _send_frames(args: argparse.Namespace, line: Listener, table: RouteTable, data: bytes, count: int | None) -> int:
+    """Send to the router as the board at the other end of a line, or to the board as the router."""
+    from router.tools import links
+    from router.tools.udp import Sent
+
+    board = links.board_at(line, table)
+    if args.origin and args.origin != board:
+        raise UsageError(f"what is sent to '{args.to}' is not from {args.origin}", "leave out --from")
+    sent = Sent()
+    with closing(links.end_of(line, is_board=args.to != board)) as end, until_interrupted():
+        if args.to != board:
+            say(f"waiting for the router to open {end.device}; press Ctrl-C to stop")
+        links.send(end, data, count, args.rate, sent)
+    print(_summary(args.case, data, args.to, sent))
+    return 0
 
 
 def _envelope(wire: Wire, name: str, words: Sequence[str]) -> bytes:
@@ -88,7 +111,7 @@ def _envelope(wire: Wire, name: str, words: Sequence[str]) -> bytes:
     return wire.encode(case, payload(case, inside), assigned(envelope.message_class(), envelope.beside, around))
 
 
-def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:
+def _summary(case: str, data: bytes, to: str, sent: Sent) -> str:
     if sent.count == 1:
         return f"sent {case} to {to}: {len(data)} bytes {data.hex()}"
     rate = f" in {sent.seconds:.2f} s ({sent.rate:.1f}/s)" if sent.rate else ""

@@ -306,12 +306,31 @@ def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
     return table.sockets[0].name if len(places) == 1 else None
 
 
+ON_LINE = WILDCARD, 0
+"""The address that a frame of a serial line counts as coming from."""
+
+
 def sent_by(endpoint: Endpoint) -> tuple[str, int]:
-    """Return the address that datagrams of an endpoint come from; on a serial line, 0.0.0.0 and the port 0."""
+    """Return the address that datagrams of an endpoint come from; on a serial line, ON_LINE."""
     address = endpoint.address.value
     if isinstance(address, SerialPlace):
-        return WILDCARD, 0
+        return ON_LINE
     return address.host, endpoint.source_port.value if endpoint.source_port else address.port
+
+
+def arrival(table: RouteTable, listener: str, peer: tuple[str, int], sender: str) -> tuple[str, tuple[str, int]] | None:
+    """Return listener and address at which a table receives what another one has received so from an endpoint.
+
+    They differ if only one of the tables has `sender` at a serial line. None: this table does not receive it.
+    """
+    endpoint, place = table.endpoints.get(sender), table.listeners.get(listener)
+    if endpoint is not None and isinstance(endpoint.address.value, SerialPlace) and endpoint.listener is not None:
+        return endpoint.listener.value, ON_LINE
+    if place is not None and (place.line is not None) == (peer == ON_LINE):
+        return listener, peer
+    if endpoint is None or not endpoint.address.value.is_known or peer != ON_LINE or not table.sockets:
+        return None
+    return endpoint.listener.value if endpoint.listener is not None else table.sockets[0].name, sent_by(endpoint)
 
 
 def destination(table: RouteTable, endpoint: Endpoint) -> tuple[tuple[str, int], bool, Cast]:

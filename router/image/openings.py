@@ -18,7 +18,7 @@ from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
 from router.table.model.endpoints import Listener
-from router.table.model.serial import LENGTHS
+from router.table.model.serial import LENGTHS, SerialLine
 
 if TYPE_CHECKING:
     from router.image.image import Symbol
@@ -29,6 +29,15 @@ _NS = 1_000_000_000
 def period(hertz: float) -> int:
     """Return the time between two messages at `max_rate`, in ns."""
     return ceil(_NS / hertz)
+
+
+def framing_of(line: SerialLine) -> c.Framing:
+    """Return the framing and checksum of a line, as the carrier executes them."""
+    framing, checksum = line.framing, line.checksum
+    kind = f"LENGTH_{framing.kind}" if framing.kind in LENGTHS else framing.kind
+    of = "CRC32" if framing.kind == "hdlc" else checksum.kind.name if checksum is not None else "NONE"
+    is_big_endian = checksum is not None and checksum.is_big_endian
+    return c.Framing(c.FramingKind[kind.upper()], c.ChecksumKind[of], is_big_endian, framing.address)
 
 
 @dataclass(slots=True)
@@ -59,9 +68,7 @@ class Openings:
         """Open the link of a serial line. It is the sender of the endpoint at the other end."""
         line = listener.line
         assert line is not None  # noqa: S101 - checked by the caller
-        framing, checksum = line.framing, line.checksum
-        kind = f"LENGTH_{framing.kind}" if framing.kind in LENGTHS else framing.kind
-        of = "CRC32" if framing.kind == "hdlc" else checksum.kind.name if checksum is not None else "NONE"
+        framing = framing_of(line)
         return self._open(
             ("sender", self.program.line_ends[listener.name].name),
             "link_open",
@@ -70,9 +77,9 @@ class Openings:
             line.baud,
             int(c.Parity[line.parity.name]),
             line.stop_bits,
-            int(c.FramingKind[kind.upper()]),
-            int(c.ChecksumKind[of]),
-            checksum is not None and checksum.is_big_endian,
+            framing.kind,
+            framing.checksum,
+            bool(framing.is_big_endian),
             framing.address,
             self.names.number(listener.name),
             self.program.counters.index("link_up", listener.name),

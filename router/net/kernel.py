@@ -193,7 +193,7 @@ def port_taken(protocol: str, port: int) -> tuple[str, str]:
     """Return which process has a port, and the remedy, for an error message. `protocol` is udp or tcp."""
     process = _process(protocol, port)
     if not _is_this(process):
-        return f"{_described(process)} has the port", "stop it, or choose another port"
+        return f"{described(process)} has the port", "stop it, or choose another port"
     from router.net.dds import is_of_ros
 
     if protocol == "udp" and is_of_ros(port, os.environ):
@@ -225,15 +225,16 @@ def why_not_bound(protocol: str, port: int, error: OSError) -> tuple[type[StartE
 
 def port_holder(protocol: str, port: int) -> str:
     """Return `python (pid 4711)`, or "another process" if /proc does not show it. `protocol` is udp or tcp."""
-    return _described(_process(protocol, port))
+    return described(_process(protocol, port))
 
 
 def port_holders(protocol: str, port: int) -> list[str]:
     """Return all processes that /proc shows to have a port: `python (pid 4711)`. `protocol` is udp or tcp."""
-    return [_described(process) for process in _processes(protocol, port)]
+    return [described(process) for process in _processes(protocol, port)]
 
 
-def _described(process: Path | None) -> str:
+def described(process: Path | None) -> str:
+    """Return `python (pid 4711)`, or "another process"."""
     return f"{_name(process)} (pid {process.name})" if process is not None else "another process"
 
 
@@ -246,7 +247,7 @@ def _processes(protocol: str, port: int) -> Iterator[Path]:
 
     wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
     processes = Path("/proc").glob("[0-9]*")
-    return (process for process in processes if not wanted.isdisjoint(_open_files(process)))
+    return (process for process in processes if not wanted.isdisjoint(open_files(process)))
 
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:
@@ -265,7 +266,8 @@ def _rows(table: str) -> Iterator[list[str]]:
         yield from (line.split() for line in Path("/proc/net", table).read_text().splitlines()[1:])
 
 
-def _open_files(process: Path) -> Iterator[str]:
+def open_files(process: Path) -> Iterator[str]:
+    """Yield what the descriptors of a process refer to, of those that may be seen."""
     try:
         descriptors = list((process / "fd").iterdir())
     except OSError:  # another user's process, or one that just ended

@@ -10,6 +10,7 @@ from typing import NamedTuple, Union
 
 from router.compiler import Checked
 from router.compiler.compiled_table import CompiledTable
+from router.compiler.network import arrival
 from router.compiler.resolution import names, resolved
 from router.datagrams import Peer, Wire
 from router.errors import DecodeError, MappingError
@@ -83,8 +84,9 @@ class Against:
         for side, run in enumerate(self._runs):
             run.advance(self._start + self.span)
             program = self._resolve(side, datagram)
-            if datagram.listener in program.table.listeners:
-                run.datagram(datagram.listener, datagram.peer, datagram.data)
+            place = arrival(program.table, datagram.listener, datagram.peer, datagram.endpoint)
+            if place is not None:
+                run.datagram(*place, datagram.data)
             else:
                 run.events.append(Rejected(run.now, datagram.listener, "no such listener"))
         old, new = (self._deliveries(side) for side in (0, 1))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns, time_ns
 
+from router.compiler.network import arrival
 from router.errors import TransportError, UsageError, did_you_mean
 from router.observe.tap import Lost
 from router.recording.about import about
@@ -20,7 +21,8 @@ from router.recording.recorder import PERIOD
 from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
-from router.tools import udp
+from router.tools import links, udp
+from router.tools.links import Pty
 from router.types.table_envelopes import Envelopes
 
 MOST_SOCKETS = 256
@@ -122,7 +124,8 @@ class Replayer:
     """Sends to `to`, or to the listener's address in `table`; from `origin`, or from the sender's address.
 
     The sender's address is that of the endpoint in `table`, else the recorded one. If this computer does not have it,
-    any address is used, and `resent` names the sender.
+    any address is used, and `resent` names the sender. At each serial line of `table`, it is the other end, unless
+    there is `to`.
     """
 
     def __init__(self, table: RouteTable | None, to: Address | None, origin: Address | None) -> None:
@@ -131,13 +134,28 @@ class Replayer:
         self._to = to
         self._origin = origin
         self._sockets: dict[tuple[str, tuple[str, int], str], socket.socket] = {}
+        self.ptys: dict[str, Pty] = {}
+        self._taken: dict[str, UsageError] = {}
+        """Why there is no pty for a line. The recording may have nothing from it."""
+        for line in table.lines if table is not None and to is None else ():
+            try:
+                self.ptys[line.name] = Pty(line)
+            except UsageError as error:
+                self._taken[line.name] = error
 
     def send(self, datagram: Recorded) -> None:
-        """Send a datagram. Raises UsageError if its listener has no address, TransportError if sending fails."""
+        """Send a datagram or frame. Raises UsageError if its listener is nowhere, TransportError if sending fails."""
+        datagram = self._moved(datagram)
+        if (taken := self._taken.get(datagram.listener)) is not None:
+            raise taken
+        if (pty := self.ptys.get(datagram.listener)) is not None:
+            links.send_once(pty, datagram.data)
+            self.resent.datagrams += 1
+            return
         key = (datagram.listener, datagram.peer, datagram.endpoint)
         if key not in self._sockets:
             if len(self._sockets) >= MOST_SOCKETS:
-                self.close()
+                self._close_sockets()
             self._sockets[key] = self._open(datagram)
         sender = self._sockets[key]
         try:
@@ -146,7 +164,19 @@ class Replayer:
             raise udp.cannot_send(Address(*sender.getpeername()), error) from error
         self.resent.datagrams += 1
 
+    def _moved(self, datagram: Recorded) -> Recorded:
+        """Return a datagram with the listener at which the table has its sender, if that is at a serial line or was."""
+        if self._table is None or self._to is not None:
+            return datagram
+        place = arrival(self._table, datagram.listener, datagram.peer, datagram.endpoint)
+        return datagram._replace(listener=place[0], peer=place[1]) if place is not None else datagram
+
     def close(self) -> None:
+        self._close_sockets()
+        for pty in self.ptys.values():
+            pty.close()
+
+    def _close_sockets(self) -> None:
         for sender in self._sockets.values():
             if sender.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
                 self.resent.refused += 1

@@ -74,7 +74,7 @@ class SimView:
         if sent and not received and statistics.is_answered and self._seconds > PATIENCE:
             line += " (is the router running with this table?)"
         if statistics.unsent:
-            line += f", refused by the kernel {statistics.unsent}"
+            line += f", not sent {statistics.unsent}"
         if undecodable := sum(inbox.undecodable for inbox in statistics.inboxes.values()):
             line += f", undecodable {undecodable}"
         return line

@@ -1,6 +1,7 @@
-"""All boards and the basestation of a route table on one machine, over real UDP.
+"""All boards and the basestation of a route table on one machine, over real UDP and serial lines.
 
-Each endpoint binds its own address, sends the payload cases that have it as their source, and receives.
+Each endpoint binds its own address, sends the payload cases that have it as their source, and receives. At the other
+end of a serial line, it is a pty in the place of the line's device.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.expressions.tree import ENVELOPE, MESSAGE
 from router.compiler.resolution import stand_in
 from router.datagrams import Wire
-from router.errors import UsageError, did_you_mean
-from router.table.addresses import Address
+from router.errors import UsageError, did_you_mean, listed
+from router.table.addresses import Address, SerialPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint
 from router.table.model.routes import ANY
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
+from router.tools.links import Pty
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
 from router.tools.udp import LOOPBACK, listener_address, located, open_udp
 from router.types.model import Int, MessageType
@@ -176,7 +178,7 @@ class Statistics:
     """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
     `is_answered`: whether a route forwards what endpoints send (what comes from ROS may not be published yet).
-    `unsent` are datagrams that the kernel refused to take.
+    `unsent` are datagrams that the kernel refused to take, and frames for a pty that is full or not open.
     `changes` are those of the boards, the newest last.
     """
 
@@ -190,9 +192,9 @@ class Statistics:
 class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
-    Raises UsageError if one cannot be bound, for a table without listeners, and for one with serial lines. `deadmen`
-    are those of the compiled program; boards halt on what they send. Boards in `obeys` obey these payload cases only.
-    `lengths` are those of lists that mappings need (`lengths.needed_lengths`).
+    Raises UsageError if one cannot be bound or opened, and for a table without listeners. `deadmen` are those of the
+    compiled program; boards halt on what they send. Boards in `obeys` obey these payload cases only. `lengths` are
+    those of lists that mappings need (`lengths.needed_lengths`).
     """
 
     def __init__(
@@ -209,11 +211,6 @@ class Simulator:
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
-        if table.lines:
-            raise UsageError(
-                f"{table.path} has serial lines, which are not simulated",
-                "simulate a table that gives their boards an 'address'",
-            )
         self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
         self.statistics.inboxes = {name: Inbox(wire, name, played.get(name)) for name in table.endpoints}
@@ -224,21 +221,20 @@ class Simulator:
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed, lengths) for stream in self._streams]
-        # Endpoints without a `listener` send to the first one.
-        self._router = listener_address(next(iter(table.listeners.values())))
-        self._destinations = {
-            name: listener_address(table.listeners[endpoint.listener.value])
-            for name, endpoint in table.endpoints.items()
-            if endpoint.listener is not None
-        }
         self._selector = selectors.DefaultSelector()
-        self._opened: list[socket.socket] = []
-        self._senders: dict[str, socket.socket] = {}
+        self._opened: list[socket.socket | Pty] = []
+        self._unopened: dict[Pty, Inbox] = {}
+        """The ptys that nobody has opened."""
+        self._senders: dict[str, Callable[[bytes], object]] = {}
         self._stopping = False
         try:
+            self._routers = {listener.name: listener_address(listener) for listener in table.sockets}
+            self._ptys = {line.name: self._kept(Pty(line)) for line in table.lines}
+            # Endpoints without a `listener` send to the first one.
+            self._first = next(iter((*self._routers, *self._ptys)))
             for endpoint in table.endpoints.values():
                 self._open_endpoint(endpoint)
-            self._senders[STRANGER] = self._open(Address(LOOPBACK, 0), STRANGER)
+            self._senders[STRANGER] = self._sending(self._open(Address(LOOPBACK, 0), STRANGER), self._first)
         except BaseException:
             self.close()
             raise
@@ -250,10 +246,22 @@ class Simulator:
         who = "1 endpoint sends" if endpoints == 1 else f"{endpoints} endpoints send"
         what = "1 payload case" if cases == 1 else f"{cases} payload cases"
         rate = sum(stream.rate for stream in self._streams)
-        return f"{who} {what}, {rate:.0f}/s, to {self._router}"
+        first, ptys = [*self._routers.values()][:1], self._ptys.values()
+        to = listed([*map(str, first), *(f"the pty {pty.device}" for pty in ptys)])
+        return f"{who} {what}, {rate:.0f}/s, to {to}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
-        """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
+        """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`.
+
+        The other end of a serial line has its pty.
+        """
+        inbox = self.statistics.inboxes[endpoint.name]
+        listener = endpoint.listener.value if endpoint.listener is not None else self._first
+        if isinstance(endpoint.address.value, SerialPlace):
+            pty = self._ptys[listener]
+            self._unopened[pty] = inbox
+            self._senders[endpoint.name] = pty.send
+            return
         port = endpoint.source_port.value if endpoint.source_port else 0
         is_learned = endpoint.address.value.is_learned
         own = Address(stand_in(self._table, endpoint, LOOPBACK), port) if is_learned else endpoint.address.value
@@ -261,8 +269,19 @@ class Simulator:
         receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)
-        self._selector.register(receiver, selectors.EVENT_READ, (receiver, self.statistics.inboxes[endpoint.name]))
-        self._senders[endpoint.name] = sender
+        self._selector.register(receiver, selectors.EVENT_READ, (receiver, inbox))
+        self._senders[endpoint.name] = self._sending(sender, listener)
+
+    def _sending(self, sender: socket.socket, listener: str) -> Callable[[bytes], object]:
+        """Return a function that sends from a socket to a listener, or to a serial line if there are only lines."""
+        if (pty := self._ptys.get(listener)) is not None:
+            return pty.send
+        router = self._routers[listener]
+        return lambda data: sender.sendto(data, router)
+
+    def _kept(self, pty: Pty) -> Pty:
+        self._opened.append(pty)
+        return pty
 
     def _open(self, address: Address, owner: str, endpoint: Endpoint | None = None) -> socket.socket:
         try:
@@ -305,6 +324,7 @@ class Simulator:
             if now >= next_report:
                 report(now)
                 next_report = max(next_report + every, now)
+            self._watch_opened()
             wake = min(now + PATIENCE, next_report, *(at for at, _ in due[:1]))
             for key, _ in self._selector.select(max(0.0, wake - (time.monotonic() - start))):
                 receiver, inbox = key.data
@@ -330,8 +350,7 @@ class Simulator:
             self._numbers[index] += 1
             stream.numbered.set(around if stream.numbered.is_beside else message, self._numbers[index])
         try:
-            to = self._destinations.get(stream.endpoint, self._router)
-            self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message, around), to)
+            self._senders[stream.endpoint](self._wire.encode(stream.case, message, around))
         except OSError:
             self.statistics.unsent += 1
         else:
@@ -344,10 +363,33 @@ class Simulator:
             return now
         return replace(now, speed=now.speed * inbox.board.pace(at))
 
-    def _receive(self, receiver: socket.socket, inbox: Inbox, now: float) -> None:
+    def _watch_opened(self) -> None:
+        """Receive from the ptys that have been opened; the others would always be ready."""
+        for pty, inbox in [*self._unopened.items()]:
+            if pty.is_open:
+                del self._unopened[pty]
+                self._selector.register(pty, selectors.EVENT_READ, (pty, inbox))
+
+    def _receive(self, receiver: socket.socket | Pty, inbox: Inbox, now: float) -> None:
+        if isinstance(receiver, Pty):
+            self._receive_frames(receiver, inbox, now)
+            return
         for _ in range(DRAIN):
             try:
                 data = receiver.recv(LARGEST_DATAGRAM)
             except BlockingIOError:
                 return
             inbox.take(now, data)
+
+    def _receive_frames(self, pty: Pty, inbox: Inbox, now: float) -> None:
+        try:
+            frames = pty.receive()
+        except OSError:  # nobody has it open any more
+            self._selector.unregister(pty)
+            self._unopened[pty] = inbox
+            return
+        for frame in frames:
+            if frame.problem:
+                inbox.undecodable += 1
+            else:
+                inbox.take(now, frame.data)

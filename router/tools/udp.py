@@ -177,8 +177,7 @@ def located(address: Address) -> Address:
 def _of_udp(address: Address, name: str) -> Address:
     """Return the address of a name of the table. Raises UsageError for a serial line."""
     if isinstance(address, SerialPlace):
-        what = f"'{name}' is at the serial line {address}, but this works over UDP only"
-        raise UsageError(what, "stop the router, and use a terminal program for the device")
+        raise UsageError(f"'{name}' is at the serial line {address}, but this works over UDP only")
     return address
 
 

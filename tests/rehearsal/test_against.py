@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 
@@ -193,3 +194,24 @@ def test_rows_add_up_whatever_comes(steps: list[tuple[int, int]], data: st.DataO
         assert min(row.same, row.changed, row.moved, row.lost, row.added) >= 0
         assert row.same + row.changed + row.moved + row.lost == row.old
         assert row.same + row.changed + row.moved + row.added == row.new
+
+
+LINE = "  uart: {serial: /dev/ttyAMA0, baud: 9600, framing: cobs}\n"
+ON_LINE_HEAD = re.sub("sensor_board: {address: [^,]*", "sensor_board: {listener: uart", HEAD).replace(
+    "endpoints:\n", f"{LINE}endpoints:\n"
+)
+
+
+@pytest.mark.parametrize("heads", [(HEAD, ON_LINE_HEAD), (ON_LINE_HEAD, HEAD), (ON_LINE_HEAD, ON_LINE_HEAD)])
+@pytest.mark.parametrize("place", [(LISTENER, SENSOR_BOARD), ("uart", ("0.0.0.0", 0))])
+def test_a_board_may_be_at_a_serial_line_in_one_table_and_in_the_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], heads: tuple[str, str], place: tuple[str, tuple[str, int]]
+) -> None:
+    listener, peer = place
+    frames = [each._replace(listener=listener, endpoint="sensor_board") for each in seen(imu(1), imu(2), peer=peer)]
+    recorded(tmp_path / "it.mcap", frames)
+    old, new = tmp_path / "old.yaml", tmp_path / "new.yaml"
+    for path, head in zip((old, new), heads, strict=True):
+        path.write_text((head + FORWARD).replace("PROTOS", str(PROTOS)))
+    assert main(["replay", str(tmp_path / "it.mcap"), "--table", str(old), "--against", str(new)]) == 0
+    assert "both deliver the same, 2 datagrams and messages" in capsys.readouterr().out

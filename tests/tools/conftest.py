@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -68,6 +69,16 @@ def table_path(tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def table(table_path: Callable[..., Path]) -> RouteTable:
     return read_table(table_path())
+
+
+@pytest.fixture
+def line_path(table_path: Callable[..., Path]) -> Path:
+    """The same table with the board at a serial line, `uart` in the folder of the table."""
+    path = table_path()
+    line = f"  uart: {{serial: {path.parent / 'uart'}, baud: 460800, framing: cobs, checksum: crc16_ccitt_false}}\n"
+    text = path.read_text().replace("endpoints:\n", f"{line}endpoints:\n", 1)
+    path.write_text(re.sub("address: 127.0.6.30:[0-9]+", "listener: uart", text))
+    return path
 
 
 @pytest.fixture

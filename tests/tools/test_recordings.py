@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,8 +17,11 @@ from router.cli import main
 from router.errors import UsageError
 from router.observe.tap import Lost
 from router.recording.reader import Recorded, Recording
+from router.table import read_table
 from router.tools import recordings
+from router.tools.links import Device
 from router.tools.recordings import TapRecording, on_time
+from tests.acceptance.site import wait_until
 from tests.ports import free_port
 from tests.recording.recorder_rig import MILLISECOND, START, again, imu, read, recorded, seen, wire
 from tests.recording.recorder_rig import table as rig_table
@@ -184,3 +189,63 @@ def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot write .*: No such file or directory"):
         recording(tmp_path / "nowhere" / "it.mcap")
+
+
+LINE_TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  uart: {{serial: {device}, baud: 460800, framing: cobs}}
+endpoints:
+  sensor_board: {{listener: uart, kind: board}}
+routes: {{}}
+"""
+
+
+@pytest.mark.parametrize("place", [("uart", ("0.0.0.0", 0)), ("rover", BOARD)], ids=["of the line", "of another table"])
+def test_frames_are_sent_at_the_other_end_of_a_line(tmp_path: Path, place: tuple[str, tuple[str, int]]) -> None:
+    """As soon as the router has opened it."""
+    listener, peer = place
+    frames = seen(imu(1), b"bad", imu(2), peer=peer)
+    path = recorded(
+        tmp_path / "it.mcap", [each._replace(listener=listener, endpoint="sensor_board") for each in frames]
+    )
+    (tmp_path / "table.yaml").write_text(LINE_TABLE.format(protos=PROTOS, device=tmp_path / "uart"))
+    (line,) = read_table(tmp_path / "table.yaml").lines
+    command = [
+        sys.executable,
+        "-m",
+        "router",
+        "replay",
+        str(path),
+        "-t",
+        str(tmp_path / "table.yaml"),
+        "--speed",
+        "max",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as replay:
+        wait_until((tmp_path / "uart").exists)
+        with closing(Device(line)) as device:
+            got: list[bytes] = []
+            while len(got) < 3:
+                got += [frame.data for frame in device.receive()]
+            out, err = replay.communicate(timeout=30)
+    assert got == [imu(1), b"bad", imu(2)]
+    assert (out, err) == (
+        "sent 3 datagrams\n",
+        f"waiting for the router to open {tmp_path}/uart; press Ctrl-C to stop\n",
+    )
+
+
+def test_a_line_whose_device_is_there_is_told_when_it_is_needed(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "uart").touch()
+    (tmp_path / "table.yaml").write_text(LINE_TABLE.format(protos=PROTOS, device=tmp_path / "uart"))
+    assert main(["replay", str(path), "-t", str(tmp_path / "table.yaml"), "--speed", "max"]) == 2
+    assert "the table does not have the listener 'rover'" in capsys.readouterr().err
+    on_line = recorded(
+        tmp_path / "line.mcap", [each._replace(listener="uart") for each in seen(imu(), peer=("0.0.0.0", 0))]
+    )
+    assert main(["replay", str(on_line), "-t", str(tmp_path / "table.yaml"), "--speed", "max"]) == 2
+    assert "uart is there already, so the other end of 'uart' cannot be played" in capsys.readouterr().err

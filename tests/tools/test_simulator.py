@@ -21,6 +21,7 @@ from router.table import read_table
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
+from router.tools.links import Device
 from router.tools.sim_view import SimView
 from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_obedience, parse_silence, streams
 from router.tools.udp import LOOPBACK, open_udp, reachable
@@ -30,6 +31,7 @@ from tests.ports import free_port
 from tests.rehearsal.test_tables import TABLES
 
 FAST = 100.0
+EMPTY_PLAIN = bytes.fromhex("1200")
 
 
 def simulate(simulator: Simulator, until: Callable[[], bool]) -> None:
@@ -170,13 +172,47 @@ def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> N
         assert [change.state for change in changes] == [State.OBEYING, State.STOPPED]
 
 
-def test_serial_lines_are_not_simulated(wire: Wire, table_path: Callable[..., Path]) -> None:
-    path = table_path()
-    text = path.read_text().replace("endpoints:\n", "endpoints:\n  lander: {listener: uart, kind: board}\n", 1)
-    line = "  uart: {serial: /dev/ttyAMA0, baud: 9600, framing: cobs}\n"
-    path.write_text(text.replace("listen:\n", f"listen:\n{line}", 1))
-    with pytest.raises(UsageError, match=r"table.yaml has serial lines, which are not simulated"):
-        Simulator(wire, read_table(path), seed=1)
+def test_a_board_on_a_serial_line_is_at_a_pty(wire: Wire, line_path: Path) -> None:
+    """Frames go both ways once the line is open, and when it is opened again."""
+    table = read_table(line_path)
+    (line,) = table.lines
+
+    def router_opens_it(simulator: Simulator) -> Iterator[None]:
+        arrivals = simulator.statistics.inboxes["board"].arrivals
+        while not simulator.statistics.unsent:
+            yield
+        for _ in range(2):
+            with closing(Device(line)) as device:
+                found: set[str] = set()
+                while not (found and arrivals):
+                    found |= {wire.decode(frame.data).case.name for frame in device.receive()}
+                    device.send(EMPTY_PLAIN)
+                    yield
+                assert (found, {*arrivals}) == ({"every_kind"}, {"plain"})
+                arrivals.clear()
+        simulator.stop()
+
+    with played(wire, table) as (simulator, router):
+        assert simulator.summary.endswith(f":{router.getsockname()[1]} and the pty {line_path.parent}/uart")
+        steps = router_opens_it(simulator)
+        simulator.run(10, 0.01, lambda _: next(steps, None))
+        assert next(steps, "all done") == "all done"
+        assert simulator.statistics.inboxes["board"].undecodable == 0
+        assert {*received(router, wire)} == {"127.0.6.10"}
+    assert not (line_path.parent / "uart").is_symlink()
+
+
+def test_bad_frames_are_undecodable(wire: Wire, line_path: Path) -> None:
+    table = read_table(line_path)
+    with played(wire, table) as (simulator, _), (line_path.parent / "uart").open("wb", buffering=0) as device:
+        device.write(b"\x05\x01\x00")
+        simulate(simulator, lambda: simulator.statistics.inboxes["board"].undecodable == 1)
+
+
+def test_a_device_that_is_there_is_not_simulated(wire: Wire, line_path: Path) -> None:
+    (line_path.parent / "uart").touch()
+    with pytest.raises(UsageError, match="uart is there already, so the other end of 'uart' cannot be played"):
+        Simulator(wire, read_table(line_path), seed=1)
 
 
 def test_names_of_nobody_are_told(wire: Wire, table_path: Callable[..., Path]) -> None:
