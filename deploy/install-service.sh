@@ -6,7 +6,8 @@
 #
 # TABLE is the router's, at first routes/rover-router.yaml. GATEWAYS is the table of a second service, at first
 # routes/rover-gateways.yaml; `none` for no second service. If TABLE has gateways itself, there is none either. Run it
-# again after changing the address or interface of a listener, `record.directory`, or the path of the checkout.
+# again after changing the address or interface of a listener, `record.directory`, or the path of the checkout, and
+# after adding the first serial line.
 #
 # It writes rover-router.service, .socket and -hold.service and rover-gateways.service to /etc/systemd/system, creates
 # /etc/default/rover-router if it does not exist, and adds the user rover-router. Listeners on an interface, for example wg0, get a unit
@@ -60,8 +61,8 @@ ROUTER_TABLE=${chosen:-$ROUTER_TABLE}
 GATEWAYS_TABLE=${gateways:-${GATEWAYS_TABLE:-none}}
 set +a
 
-# Print what a unit needs from its TABLE: lines "socket ADDRESS INTERFACE" (- for none), "write FOLDER", "read FOLDER",
-# and "gateways" if it has some. Findings go to stderr.
+# Print what a unit needs from its TABLE: lines "socket ADDRESS INTERFACE" (- for none), "line DEVICE", "write FOLDER",
+# "read FOLDER", and "gateways" if it has some. Findings go to stderr.
 facts_of() {
   set +u  # ROS's script reads variables that nobody set
   # shellcheck disable=SC1091
@@ -80,8 +81,10 @@ if checked.program is None:
 table = checked.program.table
 if table.gateways:
     print("gateways")
-for listener in checked.program.listeners:
+for listener in table.sockets:
     print("socket", listener.address.value, listener.interface or "-")
+for line in table.lines:
+    print("line", line.address.value)
 if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):
     print("write", directory)
 read = {Path(sys.argv[1]), Path(sys.base_prefix), *(file.resolve().parent for file in table.files)}
@@ -171,6 +174,11 @@ open_places() {  # SERVICE FACTS
   } >"$units/$1.d/places.conf"
 }
 open_places rover-router.service "$facts"
+if grep -q '^line ' <<<"$facts"; then
+  install -m 644 "$root/deploy/systemd/serial-lines.conf" "$units/rover-router.service.d"
+else
+  rm -f "$units/rover-router.service.d/serial-lines.conf"  # of a previous table
+fi
 if [ "$GATEWAYS_TABLE" != none ]; then
   open_places rover-gateways.service "$gateway_facts"
   sed "s|/opt/rover-router|$root|g" "$root/deploy/systemd/rover-gateways.service" >"$new/rover-gateways.service"

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
 import subprocess
 import sys
+from grp import getgrnam
 from pathlib import Path
+from resource import RLIMIT_NOFILE, getrlimit
 from typing import Any
 
 import pytest
 import yaml
 
+from router.carrier.build import compile_c
 from router.compiler import check_table
 from tests.deploy.prometheus_server import OF_GATEWAYS, SCRAPED
 from tests.tables import ROUTES
@@ -96,6 +100,72 @@ def test_compose_builds_this_dockerfile_in_the_root_of_the_checkout() -> None:
     build = COMPOSE["services"]["router"]["build"]
     assert (FOLDER / build["context"]).resolve() == ROOT
     assert ROOT / build["dockerfile"] == FOLDER / "Dockerfile"
+
+
+SERIAL = yaml.safe_load((FOLDER / "serial.yaml").read_text())["services"]
+OPEN = """
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <unistd.h>
+
+int main(int count, char **names) {
+    if (count < 2) pause();
+    for (char **name = names + 1; *name; name++)
+        printf("%d ", open(*name, O_RDWR | O_NOCTTY | O_NONBLOCK) < 0 ? errno : 0);
+}
+"""
+"""Prints the error of opening each device, 0 for none. Without devices, it waits."""
+
+RUN = r"""
+set -e
+! mountpoint -q /sys/fs/cgroup/unified || umount /sys/fs/cgroup/unified  # podman does not support hybrid cgroups
+trap 'podman rm --force --time 0 "$2" > /dev/null; podman rmi "$2" > /dev/null; rm -f /dev/$2-*' EXIT
+tar -C "$1" --mode 755 -c open | podman import --quiet - "$2" > /dev/null
+podman run --detach --name "$2" --network host --cap-drop ALL --security-opt no-new-privileges --read-only \
+  --user 1000:1000 "${@:3}" "$2" /open > /dev/null
+for number in 166 188 204 4; do
+  mknod -m 660 "/dev/$2-$number" c $number 250
+  chgrp dialout "/dev/$2-$number"
+done
+mknod -m 600 "/dev/$2-root" c 166 251
+podman exec "$2" /open /dev/null "/dev/$2-"{166,188,204,4,root}
+"""
+"""Arguments: the folder of the program, a name for image, container and devices, and options of the container."""
+
+
+def test_serial_lines_add_to_the_router_only_devices_and_the_group_of_this_computer() -> None:
+    [added] = SERIAL.values()
+    assert list(SERIAL) == ["router"]
+    assert set(added) == {"volumes", "device_cgroup_rules", "group_add"}
+    assert added["group_add"] == [str(getgrnam("dialout").gr_gid)]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("podman") is None, reason="needs root and podman")
+def test_the_router_can_open_serial_devices_that_are_plugged_in_later_and_no_others(tmp_path: Path) -> None:
+    (tmp_path / "open.c").write_text(OPEN)
+    compile_c(["-static", "-o", str(tmp_path / "open"), str(tmp_path / "open.c")])
+    files = getrlimit(RLIMIT_NOFILE)[1]  # podman cannot raise limits inside a container
+    (tmp_path / "containers.conf").write_text(
+        f'[containers]\ndefault_ulimits = ["nofile={files}:{files}", "nproc=4096:4096"]\n'
+        '[engine]\ncgroup_manager = "cgroupfs"\n'
+    )
+    router = SERIAL["router"]
+    options = [f"--volume={each}" for each in router["volumes"]]
+    options += [f"--device-cgroup-rule={each}" for each in router["device_cgroup_rules"]]
+    options += [f"--group-add={each}" for each in router["group_add"]]
+    command = ["unshare", "--mount", "bash", "-c", RUN, "run", str(tmp_path), f"router-test-{os.getpid()}", *options]
+    found = subprocess.run(
+        command,
+        env={**os.environ, "CONTAINERS_CONF": str(tmp_path / "containers.conf")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    no_driver = str(errno.ENXIO)  # as for no other reason: the container may open it
+    opened = ["0", no_driver, no_driver, no_driver, str(errno.EPERM), str(errno.EACCES)]
+    assert (found.stdout.split(), found.stderr) == (opened, "")
 
 
 def test_all_images_can_be_pinned_and_pinned_again(tmp_path: Path) -> None:

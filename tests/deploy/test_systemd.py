@@ -30,25 +30,45 @@ SEND = f"{ROUTER} send ph_info ph_value=7 --table {SIM} --to rover --from sensor
 BAD_TABLE = 78
 
 
-def analyze(*arguments: object) -> str:
+def analyze(*arguments: object, units: Path = UNITS) -> str:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("needs systemd-analyze")
     command = ["systemd-analyze", *map(str, arguments)]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=UNITS)
+    paths = {**os.environ, "SYSTEMD_UNIT_PATH": f"{units}:"}
+    finished = subprocess.run(command, env=paths, capture_output=True, text=True, check=False, cwd=units)
     assert finished.returncode == 0, finished.stdout + finished.stderr
     return finished.stdout + finished.stderr
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.endswith(".service")])
-def test_a_service_may_do_little(name: str) -> None:
-    out = analyze("security", "--offline=true", "--no-pager", name)
+def exposure(name: str, units: Path) -> float:
+    out = analyze("security", "--offline=true", "--no-pager", name, units=units)
     exposed = re.search(rf"Overall exposure level for {name}: ([\d.]+)", out)
     assert exposed is not None, out
-    assert float(exposed[1]) <= MOST_EXPOSED
+    return float(exposed[1])
 
 
-def test_the_units_are_as_systemd_wants_them() -> None:
+@pytest.fixture
+def with_lines(tmp_path: Path) -> Path:
+    """The units as they are for a table with serial lines."""
+    for name in NAMES:
+        shutil.copy(UNITS / name, tmp_path)
+    (tmp_path / "rover-router.service.d").mkdir()
+    shutil.copy(UNITS / "serial-lines.conf", tmp_path / "rover-router.service.d")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.endswith(".service")])
+def test_a_service_may_do_little(name: str) -> None:
+    assert exposure(name, UNITS) <= MOST_EXPOSED
+
+
+def test_with_serial_lines_it_may_do_little_more(with_lines: Path) -> None:
+    assert exposure("rover-router.service", UNITS) < exposure("rover-router.service", with_lines) <= MOST_EXPOSED
+
+
+def test_the_units_are_as_systemd_wants_them(with_lines: Path) -> None:
     assert analyze("verify", *(f"./{name}" for name in NAMES)) == ""
+    assert analyze("verify", "./rover-router.service", units=with_lines) == ""
 
 
 def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
@@ -304,6 +324,39 @@ listen:
     running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
     assert running.run("systemctl", "cat", "rover-router-lo.socket", check=False).returncode != 0
     assert running.state() == running.state("rover-router.socket") == "active"
+
+
+BOARD = """import os, shutil, time
+board, device = os.openpty()
+shutil.chown(os.ttyname(device), "root", "dialout")
+os.chmod(os.ttyname(device), 0o660)
+os.symlink(os.ttyname(device), "/opt/uart")
+time.sleep(3600)
+"""
+"""A serial device with the rights that udev gives it, at /opt/uart."""
+
+DEVICES = ("/dev/null", "/dev/ttyS0", "/dev/kmsg")
+
+
+def test_serial_lines_of_the_table_are_open_to_its_user_and_other_devices_are_not(running: Machine) -> None:
+    line = "{serial: /opt/uart, baud: 115200, framing: cobs}"
+    table = f"""version: 1
+extends: {SIM}
+listen: {{uart: {line}}}
+endpoints: {{lander: {{listener: uart, kind: board}}}}
+"""
+    running.run("systemd-run", "--unit", "board", sys.executable, "-c", BOARD)
+    running.wait_for("test -e /opt/uart")
+    running.shell(f"printf '%s' '{table}' > /opt/line.yaml; {ROOT}/deploy/install-service.sh /opt/line.yaml")
+    running.wait_for(f"{METRICS} | grep -q '^router_link_up{{listener=\"uart\"}} 1'")
+    assert running.show("SupplementaryGroups") == "dialout"
+    assert "/opt/uart" not in running.shell("systemctl cat rover-router.socket")
+    own = f"/sys/fs/cgroup{running.show('ControlGroup')}/cgroup.procs"
+    opened = {device: running.shell(f"echo $$ > {own}; exec 3< {device}", check=False) for device in DEVICES}
+    assert {device for device, said in opened.items() if "not permitted" in said} == {"/dev/kmsg"}
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}; systemctl stop board; rm /opt/uart")
+    assert (running.show("SupplementaryGroups"), running.show("PrivateDevices")) == ("", "yes")
+    assert running.state() == "active"
 
 
 def test_errors_of_dead_boards_leave_the_socket_as_it_is(running: Machine) -> None:
