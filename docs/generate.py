@@ -16,6 +16,8 @@ from docs import reference_pages
 from router.assets import asset
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.metrics import (
+    CALL_BOUNDS_NS,
+    CALL_OUTCOMES,
     CLIENT_DROP_REASONS,
     DROP_REASONS,
     GATEWAY_DROP_REASONS,
@@ -135,6 +137,8 @@ def metrics_page() -> str:
     """Every metric with its labels, from the counters."""
     latency = ", ".join(f"{bound / 1000:g}" for bound in LATENCY_BOUNDS_NS)
     stopping = ", ".join(f"{bound / 1e9:g}" for bound in STOPPING_BOUNDS_NS)
+    calls = ", ".join(f"{bound / 1e9:g}" for bound in CALL_BOUNDS_NS)
+    others = f"`router_deadman_stopping_seconds` has those at {stopping} s, `router_service_call_seconds` at {calls} s."
     lines = ["# Metrics", "", _MADE, "| metric | type | labels | meaning |", "|---|---|---|---|"]
     for metric in METRICS:
         kind = metric.kind if metric.kind in ("counter", "histogram") else "gauge"
@@ -152,6 +156,7 @@ def metrics_page() -> str:
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
         *_reasons("router_messages_dropped_total", DROP_REASONS),
+        *_reasons("router_service_calls_total", CALL_OUTCOMES, "outcome"),
         "## What is not counted",
         "",
         fill(_UNCOUNTED, WIDTH),
@@ -179,7 +184,7 @@ def metrics_page() -> str:
         "",
         fill(_LOG, WIDTH),
         "",
-        fill(f"{_DURATION} {latency}. `router_deadman_stopping_seconds` has those at {stopping} s.", WIDTH),
+        fill(f"{_DURATION} {latency}. {others}", WIDTH),
         "",
     ]
     return "\n".join(lines)

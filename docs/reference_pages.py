@@ -37,6 +37,9 @@ TABLE = (
     Section("Checksum", "listen.NAME.checksum", "definitions.checksum.else"),
     Section("Endpoints", "endpoints.NAME", "definitions.endpoint"),
     Section("States", "state.NAME", "definitions.state"),
+    Section("Services", "services.NAME", "definitions.service"),
+    Section("Requests of a service", "services.NAME.request", "definitions.service_request"),
+    Section("Replies to a service", "services.NAME.reply", "definitions.service_reply"),
     Section("Routes", "routes.CASE", "definitions.route"),
     Section("Source topics", "routes.CASE.source", "definitions.source_topic"),
     Section("Destinations", "routes.CASE.destinations", "definitions.destination.then"),
@@ -228,6 +231,10 @@ class SchemaPage:
         yield "definitions.listener.else", listener["else"]["required"]
         yield "definitions.endpoint", rules["endpoints"]["additionalProperties"]["required"]
         yield "definitions.state", rules["state"]["additionalProperties"]["required"]
+        service = rules["services"]["additionalProperties"]
+        yield "definitions.service", service["required"]
+        for key in ("request", "reply"):
+            yield f"definitions.service_{key}", service["properties"][key]["required"]
         route, gateway = complete["complete_route"]["else"], complete["complete_gateway"]["else"]
         yield "definitions.route", route["required"]
         yield "definitions.deadman", route["properties"]["deadman"]["else"]["required"]

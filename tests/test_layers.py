@@ -34,17 +34,20 @@ IMPORTS = {
     "startup_image": f"{GROUND} {LANGUAGE} datagrams image net carrier",
     "ros": f"{GROUND} {LANGUAGE}",
     "gateway": f"{GROUND} {LANGUAGE} datagrams image net carrier ros",
+    "services": LANGUAGE,
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
     "rehearsal": f"{LANGUAGE} values datagrams image carrier recording",
     "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal",
-    "app": f"{GROUND} {LANGUAGE} values datagrams image net carrier startup_image ros gateway recording observe",
+    "app": f"{GROUND} {LANGUAGE} values datagrams image net carrier startup_image ros gateway recording observe"
+    " services",
     "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools image carrier"
     " startup_image app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
 PURE = {"declared", "errors", "lazy_import", "library", "table", "types", "values", "compiler", "datagrams", "image"}
+PURE |= {"services"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

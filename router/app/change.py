@@ -10,6 +10,7 @@ from router.carrier.ros_routes import RosRoutes
 from router.compiler.compiled_table import CompiledTable
 
 if TYPE_CHECKING:
+    from router.app.services import ServiceChange
     from router.app.sockets import SocketChange
     from router.gateway.thread import GatewayChange
     from router.ros.endpoints import RosChange
@@ -33,5 +34,6 @@ class Change:
     ros: RosChange | None = None
     routes: RosRoutes | None = None
     gateways: GatewayChange | None = None
+    services: ServiceChange | None = None
     opens_node: bool = False
     starts_gateways: bool = False

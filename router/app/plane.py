@@ -17,13 +17,14 @@ from time import monotonic, sleep
 from router.app.change import Change
 from router.app.counts import ThreadCounts
 from router.carrier.client_deadmen import ClientDeadmen, await_receipt
-from router.carrier.events import DeadmanEvents, EventReader, EventThread, StateChange, content_of
+from router.carrier.events import DeadmanEvents, EventReader, EventThread, Reply, StateChange, content_of
 from router.carrier.forwarding import FIRST_GENERATION, Forwarding, counts_and_events
 from router.carrier.from_ros import FromRosThread
 from router.carrier.loading import LoadedImage
 from router.carrier.mirror import ActionRing, MirrorRing, Taken
 from router.carrier.publishing import PublishThread
 from router.carrier.reasons import superseded, where_refused, why_rejected
+from router.carrier.requests import RequestSender
 from router.carrier.ros_routes import RosRoutes
 from router.clock import boottime_ns
 from router.compiler.compiled_table import CompiledTable
@@ -118,8 +119,11 @@ class Plane:
             FromRosThread(library, self._deadmen.address, *counts_and_events(library, size), is_urgent=is_urgent)
             for is_urgent in (True, False)
         ]
+        self.requests = RequestSender(library, self._deadmen.address, *counts_and_events(library, size))
+        self.replied: Callable[[Reply], None] = lambda _: None
+        """Gets the replies for services."""
         # Copy the publish thread's counts before the receive thread's, so that `messages_waiting` is never negative.
-        threads = self._deadmen, self._client_deadmen, self._publishing, self._threads, *self._from_ros
+        threads = self._deadmen, self._client_deadmen, self._publishing, self._threads, *self._from_ros, self.requests
         for thread in threads:
             counts.add_thread(thread)
         self._mirrored = MirrorRing(forwarding.mirrored, self._names)
@@ -134,6 +138,7 @@ class Plane:
             reporter.learned,
             reporter.link_changed,
             self._state_changed,
+            self._take_reply,
             self._pulse,
         )
 
@@ -187,7 +192,7 @@ class Plane:
             waiting = change.before.topic_change()
         if change.is_same is False:
             self._programs = {}  # they would not explain its events
-        if change.program.publishers:
+        if change.program.publishers or change.program.services:
             self._publishing.start(_functions_of_rcl(self.library), waiting)
         for thread in self._from_ros:
             if change.routes.only(urgent=thread.is_urgent).topics:
@@ -357,6 +362,9 @@ class Plane:
             logger.info("state changed", state=change.state, before=before, after=after, source=change.source)
         else:
             logger.warning("state is back at its initial value", state=change.state, before=before, after=after)
+
+    def _take_reply(self, reply: Reply) -> None:
+        self.replied(reply)
 
     def _where_refused(self, route: str, topic: str | None, target: str, generation: int, place: int) -> str:
         """Return the place in the table; "" if an earlier program refused the message."""

@@ -11,6 +11,7 @@ then `adopt` up, then `finish` up; if a step is refused, `undo` up the table lea
 | `Images` | write and load the image; deadmen send at the start | | end and free what only the earlier image had |
 | `Topics` | open publishers and subscriptions | await events there | close the unused |
 | `Plane` | bind the image to topics, start threads | each thread changes between two messages; may refuse | |
+| `Services` | open new services | end the open calls; send by the new image | close the unused |
 | `Gateways` | open new gateways | close the unused; may refuse | serve their clients |
 
 Down the table, each needs what is above it. Up the table, each stops using what is above it: gateways close before the
@@ -28,8 +29,9 @@ from contextlib import ExitStack
 from router.app.change import Change
 from router.app.gateways import Gateways
 from router.app.plane import Images, Plane
+from router.app.services import Services
 from router.app.sockets import KernelDrops, Sockets
-from router.app.topics import Topics, needs_ros
+from router.app.topics import Topics
 from router.carrier.forwarding import Forwarding
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.extras import missing_extras
@@ -62,6 +64,7 @@ class Runtime:
         self.sockets = Sockets(self.drops, plane.library, head_start)
         self.topics = Topics(ros_args, self._note_incompatible, plane.subscriber_joined)
         self.gateways = Gateways(self.topics, self.drops, self.counts, reporter, forwarding.published.wake)
+        self.services = Services(self.topics, plane, self.counts, reporter)
         self._images = Images(forwarding, head_start)
         self._unfinished: list[Change] = []
 
@@ -112,7 +115,7 @@ class Runtime:
         change = Change(program, self.plane.image, is_first=self.plane.now is None)
         with ExitStack() as undo:
             undo.callback(self.undo, change)
-            for each in (self.counts, self.sockets, self._images, self.topics, self.plane):
+            for each in (self.counts, self.sockets, self._images, self.topics, self.plane, self.services):
                 each.prepare(change)
             undo.pop_all()
         return change
@@ -120,7 +123,7 @@ class Runtime:
     def undo(self, change: Change) -> None:
         """Close what was opened for a program that is not adopted."""
         with ExitStack() as up:  # all of them, even if one raises
-            for each in (self.sockets, self.topics, self.gateways):
+            for each in (self.sockets, self.topics, self.services, self.gateways):
                 up.callback(each.undo, change)
 
     def adopt(self, change: Change) -> None:
@@ -133,7 +136,7 @@ class Runtime:
             raise
         try:
             with ExitStack() as up:  # all of them, even if one raises
-                for each in (self.counts, self.sockets, self.topics):
+                for each in (self.counts, self.sockets, self.topics, self.services):
                     up.callback(each.adopt, change)
         except Exception as error:  # noqa: BLE001 a bug is logged: the program runs
             fault(error, "occurred after the threads had changed to another program").log()
@@ -151,7 +154,7 @@ class Runtime:
         changes, self._unfinished = self._unfinished, []
         with ExitStack() as up:
             for change in changes:
-                for each in (self.counts, self.sockets, self._images, self.topics):
+                for each in (self.counts, self.sockets, self._images, self.topics, self.services):
                     up.callback(each.finish, change)
 
     def take_over(self, program: CompiledTable) -> None:
@@ -184,6 +187,7 @@ class Runtime:
         closing.callback(self._end_client_deadmen)
         closing.callback(self.gateways.close)
         closing.callback(self._stop_plane)
+        closing.callback(self.services.close)
 
     def _stop_plane(self) -> None:
         self._unless_stuck(self.plane.stop, self.sockets.listeners)
@@ -207,7 +211,7 @@ class Runtime:
 def _check_ports(program: CompiledTable, variables: Mapping[str, str]) -> None:
     """Warn of UDP ports that ROS uses. Raises ConfigurationError for one without which ROS in this router is blind."""
     for clash in clashes(program, variables):
-        if clash.blinds and needs_ros(program) and discovers_by_multicast(variables):
+        if clash.blinds and program.uses_ros and discovers_by_multicast(variables):
             raise ConfigurationError(
                 f"{clash.span}: {clash}", f"{BELOW_ROS}; or give all ROS nodes another ROS_DOMAIN_ID"
             )

@@ -46,14 +46,14 @@ class Topics:
 
     def check(self, program: CompiledTable) -> None:
         """Check what opening ROS may fail for, before deadmen send. Raises StartError."""
-        if self.node is None and needs_ros(program):
+        if self.node is None and program.uses_ros:
             check_environment(os.environ)
             self._check_arguments(program)
 
     def prepare(self, change: Change) -> None:
         """Open the node if it is needed, and the topics that are not open yet. Raises StartError."""
         program = change.program
-        if self.node is None and not needs_ros(program):
+        if self.node is None and not program.uses_ros:
             return
         if self.node is None:
             self.node, change.opens_node = self._open_node(program), True
@@ -144,13 +144,9 @@ class Topics:
             yield (f"/{self.node.name}",), self.node.surroundings.namesakes
 
 
-def needs_ros(program: CompiledTable) -> bool:
-    return bool(program.publishers or program.subscriptions or program.gateways)
-
-
 def _missing_ros(program: CompiledTable, error: ImportError) -> StartError:
     kind = StartError if is_shortage(error) else ConfigurationError
-    return kind(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
+    return kind(f"{program.table.path} has topics or services, and ROS 2 cannot be loaded: {error}", ros_remedy())
 
 
 def _topic_spans(program: CompiledTable) -> Mapping[str, SourceSpan]:

@@ -24,6 +24,7 @@ from router.declared import (
     LinkEvent,
     LostEvent,
     Reason,
+    ReplyEvent,
     ReturnedEvent,
     StateContent,
     StateEvent,
@@ -82,6 +83,14 @@ class LinkChange:
 
 
 @dataclass(frozen=True, slots=True)
+class Reply:
+    """A reply for a service: its response as CDR bytes, after the value of `match`."""
+
+    service: str
+    message: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class CountedReport:
     """A loss or a rejection, and the counter of its kind."""
 
@@ -114,7 +123,7 @@ class EventReader:
 
     def read(
         self, kind: int, record: memoryview
-    ) -> DeadmanEvents | StateChange | Learned | Returned | LinkChange | CountedReport:
+    ) -> DeadmanEvents | StateChange | Learned | Returned | LinkChange | Reply | CountedReport:
         if kind in {EventKind.REJECTED, EventKind.SUPERSEDED}:
             return self._of_datagram(record)
         if kind == EventKind.LOST:
@@ -128,6 +137,9 @@ class EventReader:
             learned = LearnedEvent.from_buffer(record)
             earlier, present = (origin_text(at) if at else "" for at in (learned.before, learned.after))
             return Learned(self._name(learned.endpoint), earlier, present)
+        if kind == EventKind.REPLY:
+            reply, begin = ReplyEvent.from_buffer(record), ctypes.sizeof(ReplyEvent)
+            return Reply(self._name(reply.target), bytes(record[begin : begin + reply.length]))
         if kind == EventKind.STATE:
             changed = StateEvent.from_buffer(record)
             source = self._name(changed.source) if changed.source != NO_NAME else None
@@ -187,7 +199,7 @@ class EventThread:
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
     that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s), `learned` one
     whose address was learned, with the address before and now, `link_changed` a link and why it is closed (errno; 0: it
-    is open), `state_changed` a state that has changed, `of_deadmen` everything else.
+    is open), `state_changed` a state that has changed, `replied` a reply for a service, `of_deadmen` everything else.
     """
 
     def __init__(
@@ -200,6 +212,7 @@ class EventThread:
         learned: Callable[[str, str, str], None],
         link_changed: Callable[[str, int], None],
         state_changed: Callable[[StateChange], None],
+        replied: Callable[[Reply], None],
         pulse: Callable[[], None],
     ) -> None:
         self._threads = threads
@@ -210,6 +223,7 @@ class EventThread:
         self._learned = learned
         self._link_changed = link_changed
         self._state_changed = state_changed
+        self._replied = replied
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in threads]
@@ -262,6 +276,8 @@ class EventThread:
                 self._state_changed(change)
             case LinkChange(listener, error):
                 self._link_changed(listener, error)
+            case Reply() as reply:
+                self._replied(reply)
             case CountedReport(counter, report):
                 self._count(counter, report, counters, last)
             case of_deadman:

@@ -204,6 +204,10 @@ class LoadedImage:
         for topic, offset, count, is_urgent in self.image.ros_topics:
             yield topic, (c.RosRoute * count).from_address(self._base + offset), is_urgent
 
+    def requests(self) -> dict[str, ctypes.Array[c.RosRoute]]:
+        """Return the route of the requests of each service."""
+        return {label: (c.RosRoute * 1).from_address(self._base + offset) for label, offset in self.image.requests}
+
     def timers(self, before: LoadedImage | None = None, ended: Iterable[int] = (), *, of_topics: bool) -> c.TimerChange:
         """Return the changes to the timers of topics or of endpoints when this image replaces the one before.
 

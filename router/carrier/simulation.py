@@ -15,6 +15,7 @@ from router.carrier.events import (
     EventReader,
     Learned,
     LinkChange,
+    Reply,
     Returned,
     StateChange,
 )
@@ -50,7 +51,7 @@ class Output(NamedTuple):
     data: bytes
 
 
-Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Learned, Returned, LinkChange, CountedReport]
+Record = Union[Time, Increment, Output, DeadmanEvents, StateChange, Learned, Returned, LinkChange, Reply, CountedReport]
 
 
 class Simulation:
@@ -245,9 +246,9 @@ class _Running:
     def __init__(self, program: CompiledTable, image: LoadedImage) -> None:
         self.program, self.image = program, image
         self.listeners: Mapping[str, int] = {plan.name: number for number, plan in enumerate(program.listeners)}
-        routes = [*image.ros_routes()]
-        self.topic_numbers: Mapping[str, int] = {topic: number for number, (topic, *_) in enumerate(routes)}
-        topics = [c.RosTopic(routes=each, route_count=len(each)) for _, each, _ in routes]
+        routes = {topic: each for topic, each, _ in image.ros_routes()} | image.requests()
+        self.topic_numbers: Mapping[str, int] = {topic: number for number, topic in enumerate(routes)}
+        topics = [c.RosTopic(routes=each, route_count=len(each)) for each in routes.values()]
         self.topics = (c.RosTopic * len(topics))(*topics)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from router.compiler.beside import check_beside, unfilled
 from router.compiler.brakes import brake_findings
-from router.compiler.checked import CheckedRoute, CheckedState
+from router.compiler.checked import CheckedRoute, CheckedService, CheckedState
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
@@ -22,6 +22,7 @@ from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.routes import check_routes, clash_findings
+from router.compiler.services import check_services
 from router.compiler.states import check_states, condition_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Code, Diagnostic, Severity, TableError
@@ -69,6 +70,7 @@ class Checked:
     boards: Mapping[str, BoardLimits] = field(default_factory=dict)
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
     states: Mapping[str, CheckedState] = field(default_factory=dict)
+    services: Sequence[CheckedService] = ()
     lowered: Lowered | None = None
 
     @property
@@ -116,7 +118,8 @@ def check_table(
     lookup = Lookup(table, envelopes, definitions, boards)
     lookup.beside = check_beside(lookup)
     states = check_states(lookup)
-    routes = check_routes(lookup)
+    own_routes = check_routes(lookup)
+    services, routes = check_services(lookup, own_routes)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
     own_type = lookup.ros_type(own) if own else None
@@ -130,8 +133,8 @@ def check_table(
         *lookup.findings,
         *condition_findings(lookup, routes),
         *clash_findings(table),
-        *brake_findings(table, routes),
-        *topic_findings(table, [checked.route for checked in routes]),
+        *brake_findings(table, own_routes),
+        *topic_findings(table, [checked.route for checked in own_routes]),
     ]
     own_topics = [(own, own_type)] if own and own_type else []
     lowered = None
@@ -141,7 +144,19 @@ def check_table(
         lowered = None if limits else lowered
     for schema in envelopes.schemas:
         schema.sources.close()
-    return Checked(path, in_order(findings), table, envelopes, routes, gateways, boards, own_topics, states, lowered)
+    return Checked(
+        path,
+        in_order(findings),
+        table,
+        envelopes,
+        routes,
+        gateways,
+        boards,
+        own_topics,
+        states,
+        services,
+        lowered,
+    )
 
 
 def _has_errors(findings: Iterable[Diagnostic]) -> bool:
@@ -168,6 +183,7 @@ def _limits(table: RouteTable, envelope: Envelope, lock: LockComparison) -> Boar
     schema = envelope.schema
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
     named = {route.case.value for route in table.routes}
+    named |= {service.request.case.value for service in table.services.values()}
     named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
     cases = [case for name, case in envelope.cases.items() if name in named]
     longest, payloads = lock.max_size or envelope.max_size, payload_fields(envelope, cases, schema.board_options)

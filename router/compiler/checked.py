@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from router.compiler.plan import Record
 from router.errors import SourceSpan
 from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.routes import Route
+from router.table.model.services import Service
 from router.table.model.state import State
 from router.table.model.targets import Destination, OnLimit, Priority, Topic
 from router.types.model import MessageType
@@ -30,7 +32,7 @@ class Target:
     `endpoint` is set for a destination, `type` for a published topic, `for_each` for one that gets each element of a
     list. Without a `plan`, the datagram is forwarded unchanged; `rows` describe the mapping for `explain`. `deadmen`
     are the routes whose deadmen each command to this target feeds (its own route's) or disarms. `beside` is what `set`
-    of the endpoint fills in messages with a plan.
+    of the endpoint fills in messages with a plan. `is_request`: its messages are requests of a service, and never wait.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
     without a `when`, or without a `plan`. `gate` is the part of the condition that reads only states, if messages may
@@ -49,6 +51,7 @@ class Target:
     declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
     beside: Beside | None = None
+    is_request: bool = False
     for_each: Node | None = None
     condition: Routine = ()
     gate: Routine = ()
@@ -87,7 +90,7 @@ class Target:
     @property
     def is_deferred(self) -> bool:
         """Whether its messages may be deferred and then sent by another thread: see `on_limit` and `bandwidth`."""
-        has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
+        has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None and not self.is_request
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 
 
@@ -106,6 +109,29 @@ class CheckedSubscription:
     for_each: Node | None
     stamp: Node | None
     targets: tuple[Target, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedService:
+    """A service whose payload cases and types exist.
+
+    `ros_name` is absolute. `request` is the route of its requests. `match` are the names of the field that request and
+    reply have in common, None without. `responses` has the CDR bytes of `on_timeout` by outcome.
+    """
+
+    declared: Service
+    ros_name: str
+    request_type: MessageType
+    response_type: MessageType
+    request: CheckedRoute
+    reply_case: PayloadCase
+    match: tuple[str, ...] | None
+    responses: Mapping[str, bytes]
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """The payload case of the replies, and their sender."""
+        return self.reply_case.name, (self.declared.reply.sender or self.declared.request.to).value
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from router.compiler.expressions.kinds import BoolKind, EnumKind, StringKind
 from router.compiler.expressions.tree import STATE
 from router.compiler.metrics import Counters
 from router.declared import BesideEncoding, BesideValue
+from router.errors import SourceSpan
 from router.table.addresses import SerialPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
@@ -36,6 +37,27 @@ def state_label(name: str) -> str:
     """Return the name of a state in expressions and the log, as the target of messages without a value, and as the
     route of messages of its topic."""
     return f"{STATE}.{name}"
+
+
+def service_label(name: str) -> str:
+    """Return the name of a service as the route and topic of its requests, and as the target of its replies."""
+    return f"service.{name}"
+
+
+OUTCOMES: Mapping[str, str] = {
+    "timed_out": "{endpoint} did not reply within {timeout}",
+    "busy": "{endpoint} has not replied to an earlier call",
+    "unsent": "{endpoint} cannot be sent to",
+    "refused": "the request is too old, or {endpoint} cannot take its values",
+    "cancelled": "the router has reloaded its table, or stops",
+}
+"""How a call ends without a reply, with the text of `reason` in `on_timeout`."""
+
+ANSWERED = "answered"
+"""The outcome of a call with a reply."""
+
+MOST_CALLS = (1 << 31) - 1
+"""The number of the last call of a service before 1 follows: it fits each integer of protobuf."""
 
 
 def source_label(source: str | None) -> str:
@@ -203,6 +225,32 @@ class StatePlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ServicePlan:
+    """A ROS service that an endpoint answers. `timeout` is in ns, `responses` has CDR bytes by outcome (OUTCOMES).
+
+    `ros_name` is absolute. `definitions` are those of request and response, as in TopicPlan. `match` are the names of
+    the field that tells which call a reply answers, None if any reply does. `group` is the payload case of the replies
+    with their sender: services with the same one get the same replies.
+    """
+
+    name: str
+    ros_name: str
+    type_name: str
+    definitions: Mapping[str, tuple[tuple[str, str], ...]]
+    endpoint: str
+    match: tuple[str, ...] | None
+    group: tuple[str, str]
+    timeout: int
+    retries: int
+    responses: Mapping[str, bytes]
+    span: SourceSpan
+
+    @property
+    def label(self) -> str:
+        return service_label(self.name)
+
+
+@dataclass(frozen=True, slots=True)
 class InboundPlan:
     """A topic that a gateway's clients may publish on; `label` is its absolute name, which clients use.
 
@@ -268,6 +316,7 @@ class CompiledTable:
     boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
     states: tuple[StatePlan, ...] = ()
+    services: tuple[ServicePlan, ...] = ()
     named: CompiledTable | None = None
 
     @property
@@ -289,6 +338,11 @@ class CompiledTable:
     @property
     def routes(self) -> Iterator[RoutePlan]:
         return chain.from_iterable((*self.inbound.values(), *self.outbound.values()))
+
+    @property
+    def uses_ros(self) -> bool:
+        """Whether it needs a ROS node."""
+        return bool(self.publishers or self.subscriptions or self.gateways or self.services)
 
     @property
     def client_deadmen(self) -> list[DeadmanPlan]:

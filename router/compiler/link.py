@@ -5,11 +5,19 @@ Expects a table without errors and checks nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from router.compiler.checked import CheckedRoute, CheckedState, CheckedSubscription, Target
-from router.compiler.compiled_table import STRANGER, CompiledTable, GatewayPlan, RoutePlan, StatePlan, TopicPlan
+from router.compiler.checked import CheckedRoute, CheckedService, CheckedState, CheckedSubscription, Target
+from router.compiler.compiled_table import (
+    STRANGER,
+    CompiledTable,
+    GatewayPlan,
+    RoutePlan,
+    ServicePlan,
+    StatePlan,
+    TopicPlan,
+)
 from router.compiler.lookup import definitions_of
 from router.compiler.lowering import Lowered
 from router.compiler.metrics import Counters
@@ -48,13 +56,19 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     deadmen = tuple(route.deadman for route in served if route.deadman)
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
+    services = tuple(map(_service, checked.services))
+    labels = {service.label for service in services}
     program = CompiledTable(
         table=table,
         envelopes=envelopes,
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
-        publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
-        subscriptions=_topics((feed.topic, feed.type) for feed in [*_feeds(served), *_feeds_of_states(checked)]),
+        publishers=_topics([*_published(served, labels), *checked.own_topics], _published_by_clients(checked.gateways)),
+        subscriptions=_topics(
+            (feed.topic, feed.type)
+            for feed in [*_feeds(served), *_feeds_of_states(checked)]
+            if feed.topic.topic.value not in labels
+        ),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
@@ -62,6 +76,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         lowered=lowered,
         boards=checked.boards,
         gateways=tuple(checked.gateways),
+        services=services,
         states=tuple(_state(state, lowered, inbound, served) for state in checked.states.values()),
     )
     open_series(program)
@@ -92,6 +107,23 @@ def _state(
     )
 
 
+def _service(checked: CheckedService) -> ServicePlan:
+    declared = checked.declared
+    return ServicePlan(
+        name=declared.name,
+        ros_name=checked.ros_name,
+        type_name=declared.type.value,
+        definitions=definitions_of(checked.request_type) | definitions_of(checked.response_type),
+        endpoint=declared.request.to.value,
+        match=checked.match,
+        group=checked.group,
+        timeout=declared.timeout.value,
+        retries=declared.retries,
+        responses=checked.responses,
+        span=declared.span,
+    )
+
+
 def _feeds(routes: Iterable[CheckedRoute]) -> Iterator[CheckedSubscription]:
     for checked in routes:
         yield from checked.subscriptions
@@ -101,11 +133,11 @@ def _feeds_of_states(checked: Checked) -> Iterator[CheckedSubscription]:
     yield from (state.feed for state in checked.states.values() if state.feed is not None)
 
 
-def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
-    """Yield the topics that routes publish on."""
+def _published(routes: Iterable[CheckedRoute], services: Container[str]) -> Iterator[tuple[Topic, MessageType]]:
+    """Yield the topics that routes publish on, without targets that are services."""
     for checked in routes:
         for used in checked.targets:
-            if used.topic and used.type:
+            if used.topic and used.type and used.label not in services:
                 yield used.topic, used.type
 
 

@@ -168,7 +168,8 @@ class Lookup:
             return
         if other := _OTHER_INTERFACES.fullmatch(name.value):
             what = f"'{name.value}' is {'a service' if other['kind'] == 'srv' else 'an action'}, not a message"
-            hint = "topics have message types, such as std_msgs/msg/Bool; services and actions are not routed"
+            instead = "a service belongs in `services`" if other["kind"] == "srv" else "actions are not routed"
+            hint = f"topics have message types, such as std_msgs/msg/Bool; {instead}"
             self.report(name.span, Code.UNKNOWN_ROS_TYPE, what, hint)
             return
         hint = _ros_type_hint(name.value, known)

@@ -47,6 +47,8 @@ STOPPING_BOUNDS_NS = tuple(
     ms * 1_000_000 for ms in (20, 50, 100, 200, 500, 1000, 2000, 3000, 5000, 10_000, 20_000, 30_000)
 )
 """Bounds of histograms, as in `native/counters.h`."""
+CALL_BOUNDS_NS = tuple(ms * 1_000_000 for ms in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000))
+"""Bounds of the histogram of calls, as many as the others have."""
 
 HISTOGRAM_CELLS = HISTOGRAM_BOUNDS + 2
 """Consecutive indexes of a histogram: one for each bound, one for everything slower, and the sum (ns)."""
@@ -176,6 +178,17 @@ METRICS = (
         ("state", "source"),
         "How long ago a message of the source that set the state arrived; no series until one has.",
     ),
+    Metric("service_calls", "counter", ("service", "outcome"), "Calls of a service that have ended, by outcome."),
+    Metric("service_calls_open", "number", ("service",), "Calls that currently wait for a reply."),
+    Metric(
+        "service_call_seconds",
+        "histogram",
+        ("service",),
+        "Time from taking a call until its response, also without a reply.",
+        bounds=CALL_BOUNDS_NS,
+    ),
+    Metric("service_retries", "counter", ("service",), "Requests sent again, because no reply came in time."),
+    Metric("service_replies_unmatched", "counter", ("service",), "Replies that no call was waiting for."),
     Metric("gateway_clients", "number", ("route",), "Current clients of a gateway."),
     Metric(
         "gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of the router's."
@@ -299,6 +312,16 @@ UNSENT_REASONS = ("send_error", "send_buffer_full", "queue_full")
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """The DROP_REASONS that apply to messages of clients."""
 
+CALL_OUTCOMES: Mapping[str, str] = {
+    "answered": "the endpoint replied",
+    "timed_out": "no reply came within `timeout`, after all `retries`",
+    "busy": "an earlier call was open, and without `match` there is one at a time",
+    "unsent": "the endpoint could not be sent to",
+    "refused": "the call was older than `ttl`, or its values do not fit the request",
+    "cancelled": "a reload or the stop of the router ended it",
+}
+"""How a call of a service ends, with the meaning."""
+
 TOPIC_STATES: Mapping[str, str] = {
     "served": "a client gets it",
     "several_types": "served with the table's type, or else with the one that most of its publishers use",
@@ -390,10 +413,12 @@ class Mismatch(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Report:
     """A loss. `kind` is `drop` (for one target), `reject` (of a whole datagram), `supersede` (of a payload that a later
-    one in its datagram replaces) or `deadman` (of its own datagram).
+    one in its datagram replaces), `deadman` (of its own datagram), `call` (of a service, without a reply) or `reply`
+    (that no call waits for).
 
-    `place` is the route, or the listener for a reject or supersede, which have an empty `target`. `times` is the number
-    of such losses since the last report. `mismatch` is set if no route accepts this payload case from there.
+    `place` is the route, the listener for a reject or supersede, which have an empty `target`, or the service for a
+    call or reply. `times` is the number of such losses since the last report. `mismatch` is set if no route accepts
+    this payload case from there.
     """
 
     kind: str

@@ -12,7 +12,7 @@ from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKin
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable, constant_of
 from router.compiler.feeds import deadmen_of
-from router.compiler.lookup import Lookup
+from router.compiler.lookup import NO_NAMES, Lookup
 from router.compiler.mapping import build
 from router.compiler.obeyed import check_obeyed
 from router.compiler.states import sets_state
@@ -40,10 +40,13 @@ def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
 def _coverage(lookup: Lookup) -> None:
     table, cases, unroutable = lookup.table, lookup.envelopes.cases, lookup.envelopes.unroutable
     names = [route.case.value for route in table.routes]
+    names += [each.case.value for service in table.services.values() for each in (service.request, service.reply)]
     # a misspelt case is one finding, not two
     covered = {name if name in cases else nearest(name, cases) for name in names if name not in unroutable}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
     missing = [name for name in cases if name not in covered and name not in lookup.envelopes.parts]
+    if any(name.startswith("services/") for name in table.broken):
+        return  # it may cover them
     if missing and table.routes_span is not None:  # a table with only gateways has no routes
         plural = "payload case" if len(missing) == 1 else "payload cases"
         message = f"no route for the {plural} {', '.join(missing)}"
@@ -266,16 +269,27 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
         if next(other for other in route.source_topics if other.topic.value == name) is not topic:
             lookup.report(topic.topic.span, Code.BAD_VALUE, f"topic '{name}' is listed twice", "name it once")
         ros_type = lookup.ros_type(topic)
-        if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, recipients)):
+        if ros_type is not None and (checked := subscription(lookup, route, case, topic, ros_type, recipients)):
             subscriptions.append(checked)
     return CheckedRoute(route, case, subscriptions=tuple(subscriptions))
 
 
-def _subscription(
-    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, recipients: Destinations
+def subscription(
+    lookup: Lookup,
+    route: Route,
+    case: PayloadCase,
+    topic: Topic,
+    ros_type: MessageType,
+    recipients: Destinations,
+    numbered: MessageType | None = None,
+    names: Mapping[str, Node] = NO_NAMES,
 ) -> CheckedSubscription | None:
-    """Check a topic and its targets. Return None if the type of `item` is unknown: every use would be reported."""
-    scope = lookup.scope(ros_type, ros_type)
+    """Check a topic and its targets. Return None if the type of `item` is unknown: every use would be reported.
+
+    Of a service, `numbered` is the request with what the router adds to it, and `names` are further variables.
+    """
+    message = numbered or ros_type
+    scope = lookup.scope(message, ros_type, names)
     stamp = stamp_of(scope, topic.span) if route.ttl else None
     for_each = None
     if route.for_each is not None:
@@ -298,7 +312,7 @@ def _subscription(
         target = _destination(lookup, route, destination, endpoint, scope)
         beside = lookup.beside.get(target.label)
         targets.append(replace(target, plan=mapping.plan, rows=tuple(mapping.rows), beside=beside))
-    return CheckedSubscription(topic, ros_type, when, for_each, stamp, tuple(targets))
+    return CheckedSubscription(topic, message, when, for_each, stamp, tuple(targets))
 
 
 def _element_type(elements: Node) -> MessageType | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from router.compiler.compiled_table import (
     STRANGER,
@@ -14,6 +14,7 @@ from router.compiler.compiled_table import (
     source_label,
 )
 from router.compiler.metrics import (
+    CALL_OUTCOMES,
     CLIENT_DROP_REASONS,
     CLIENTS,
     DROP_REASONS,
@@ -41,14 +42,18 @@ def open_series(program: CompiledTable) -> None:
     counters, table = program.counters, program.table
     _open_listeners(counters, table, program.envelopes)
     _open_own(counters, table)
+    services = {service.label for service in program.services}
     for plan in program.routes:
-        _open_route(counters, table, plan)
+        _open_route(counters, table, plan, services)
     for deadman in program.deadmen:
         _open_deadman(counters, deadman)
     for gateway in program.gateways:
         _open_gateway(counters, gateway)
     for state in program.states:
         _open_state(counters, state)
+    for service in program.services:
+        _open_each(counters, "service_calls", service.name, last=CALL_OUTCOMES)
+        _open(counters, _OF_SERVICES, service.name)
 
 
 def _open(counters: Counters, metrics: Iterable[str], *labels: str) -> None:
@@ -97,12 +102,16 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
         _open_each(counters, "recordings_unsaved", last=UNSAVED_REASONS)
 
 
-def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
-    """Open the series of a route, or of one source topic of a route from ROS."""
+_OF_SERVICES = "service_calls_open", "service_call_seconds", "service_retries", "service_replies_unmatched"
+
+
+def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan, services: Collection[str]) -> None:
+    """Open the series of a route, or of one source topic of a route from ROS. `services` are no topics."""
     route = plan.route
     _open(counters, ("route_duration_seconds", "route_silence_seconds"), route)
     published = [target.label for target in plan.targets if target.is_topic]
-    for topic in published if plan.topic is None else [plan.topic]:
+    topics = published if plan.topic is None else [plan.topic]
+    for topic in (name for name in topics if name not in services):
         _open_each(counters, "qos_incompatible", route, topic, last=QOS_POLICIES)
     if plan.topic is None:
         sources = [source for source in (*table.endpoints, STRANGER) if source in plan.sources]

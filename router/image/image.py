@@ -17,7 +17,8 @@ class Image:
 
     The memory can be loaded at any address: the words at `relocations` hold offsets, `imports` lists the words of each
     symbol, and `generations` has the offsets of fields for the number of the program. `program`, `listener_array` and
-    the arrays of `ros_topics` (topic, offset, number of routes, whether one is urgent) are structures in it.
+    the arrays of `ros_topics` (topic, offset, number of routes, whether one is urgent) are structures in it, and so are
+    the routes of `requests` to services (service, offset).
 
     To open, by name: `listeners` (name, address, interface, receive buffer, multicast groups), `senders` (name,
     address, whether it is a board, its cast as in `compiler.network`, listener to send from), and `topics` (name,
@@ -40,6 +41,7 @@ class Image:
     program: int
     listener_array: int
     ros_topics: list[tuple[str, int, int, bool]]
+    requests: list[tuple[str, int]]
     listeners: list[tuple[str, tuple[str, int], str | None, int, tuple[str, ...]]]
     senders: list[tuple[str, tuple[str, int], bool, tuple[str | None, int, bool] | str | None, str | None]]
     line_ends: list[tuple[str, str]]

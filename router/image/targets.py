@@ -202,13 +202,21 @@ class TargetWriter:
 
     def _topic(self, topic: str) -> c.Target:
         if topic not in self._topics:
-            address = self.openings.symbols.address
-            written = c.Topic(
-                publisher=address("publisher", topic),
-                demand=ctypes.cast(address("demand", topic), ctypes.POINTER(c.Demand)),
-            )
-            self._topics[topic] = self.arrays.add(written)
+            is_service = any(service.label == topic for service in self.program.services)
+            self._topics[topic] = self.arrays.add(self._service() if is_service else self._published(topic))
         return c.Target(topic=ctypes.pointer(self._topics[topic]))
+
+    def _published(self, topic: str) -> c.Topic:
+        address = self.openings.symbols.address
+        return c.Topic(
+            publisher=address("publisher", topic),
+            demand=ctypes.cast(address("demand", topic), ctypes.POINTER(c.Demand)),
+        )
+
+    def _service(self) -> c.Topic:
+        """Write what stands for a topic: a service, whose replies Python takes."""
+        demand = self.arrays.add(c.Demand(wanted=c.Wanted.EVERY_REPLY))
+        return c.Topic(demand=ctypes.pointer(demand))
 
     def _feed(self, plan: RoutePlan, target: Target, route: str) -> c.Feed:
         """Return the effect of the target's commands on the deadman of a route: its own, or one that they disarm."""

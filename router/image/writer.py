@@ -43,6 +43,7 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
     structure = arrays.add(_Writer(program, targets, numbers, columns).program_of(plans))
     ros = {topic: _ros_routes(targets, topic, feeds) for topic, feeds in program.lowered.from_ros.items()}
+    services = [service.label for service in program.services]
     for client_deadman in program.client_deadmen:
         openings.client_deadman(client_deadman)
     memory = Memory(arrays)
@@ -55,7 +56,9 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
         ros_topics=[
             (topic, memory.offset(ctypes.addressof(routes)), len(routes), any(feed.is_urgent for feed in feeds))
             for (topic, feeds), routes in zip(program.lowered.from_ros.items(), ros.values(), strict=True)
+            if topic not in services
         ],
+        requests=[(label, memory.offset(ctypes.addressof(ros[label]))) for label in services],
         listeners=[
             (each.name, tuple(each.address.value), each.interface, each.receive_buffer, each.group_hosts)
             for each in program.table.sockets

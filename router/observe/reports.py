@@ -24,8 +24,12 @@ _EVENTS = {
     "supersede": "datagram has several payloads; only the last one counts",
     "drop": "message dropped",
     "deadman": "deadman could not send",
+    "call": "call of a service was not answered by the endpoint",
+    "reply": "reply for a service was dropped",
 }
 """Log events by kind of report."""
+_PLACES = {"reject": "listener", "supersede": "listener", "call": "service", "reply": "service"}
+"""What the place of a report is, if it is not a route."""
 
 
 class Reporter:
@@ -75,7 +79,7 @@ class Reporter:
             self._remember(report.mismatch)
         if report.kind == "drop":
             self._lost[report.place, report.target] = boottime_ns(), report
-        where = "listener" if report.kind in ("reject", "supersede") else "route"
+        where = _PLACES.get(report.kind, "route")
         values: dict[str, Any] = {
             where: report.place,
             "target": report.target,

@@ -76,7 +76,7 @@ def without_effect(
     """
     rules = list(_rules(ros_args))
     node = _remapped(program.table.node, rules)
-    has_node = bool(program.publishers or program.subscriptions or program.gateways)
+    has_node = program.uses_ros
     variables = sorted(name.lower() for name in names_read)
     for owner, name in dict.fromkeys((parameter.node, parameter.name) for parameter in _parameters(ros_args)):
         read = {*variables, ROUTES_PATH, *(_PARAMETERS_OF_ROS if has_node else ())}
@@ -85,11 +85,11 @@ def without_effect(
     topics = _topics(program, node)
     for rule in rules:
         if not has_node:
-            yield f"-r {rule.text}", "the table has neither topics nor gateways, so no ROS node"
+            yield f"-r {rule.text}", "the table has no topics, services or gateways, so no ROS node"
         elif rule.match not in _NODE_RULES or not _is_for(rule.node, program.table.node):
             if not _is_for(rule.node, node):
                 yield f"-r {rule.text}", f"it is for the node '{rule.node}', but this one is '{node.name}'"
-            elif resolved(rule.match.removeprefix("rostopic://"), node) not in topics:
+            elif resolved(rule.match.removeprefix("rostopic://").removeprefix("rosservice://"), node) not in topics:
                 yield f"-r {rule.text}", _for_rule(rule.match, topics, node)
     for option in ros_args:
         if option in _LOGGING or option.removeprefix("--enable-").removeprefix("--disable-") in _SWITCHES:
@@ -106,14 +106,15 @@ def _for_parameter(name: str, read: Collection[str], variables: Sequence[str]) -
 
 def _for_rule(match: str, topics: Mapping[str, str], node: NodeSettings) -> str:
     near = nearest(match, topics.values()) or nearest(resolved(match, node), topics)
-    return f"did you mean '{near}'?" if near else "no topic of the table has this name"
+    return f"did you mean '{near}'?" if near else "no topic or service of the table has this name"
 
 
 def _topics(program: CompiledTable, node: NodeSettings) -> dict[str, str]:
-    """Return the topics as the table writes them, by absolute name."""
+    """Return the topics and services as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [entry.topic.topic.value for gateway in program.gateways for entry in gateway.settings.inbound]
-    return {resolved(topic, node): topic for topic in (*plans, *inbound)}
+    services = [plan.name for plan in program.services]
+    return {resolved(name, node): name for name in (*plans, *inbound, *services)}
 
 
 def _remapped(node: NodeSettings, rules: Sequence[Rule]) -> NodeSettings:

@@ -26,7 +26,8 @@ _set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 
 # The middleware calls `void callback(const void *user_data, size_t messages)`; where arguments are passed in registers,
 # libc's `int eventfd_write(int fd, uint64_t value)` can be that callback, with the descriptor as user data.
-_ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+"""The callback that adds the number of new messages or requests to an eventfd."""
 
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of the functions with which a native thread takes messages and resets errors."""
@@ -90,7 +91,7 @@ class RawSubscription:
         wait for the interpreter lock while the thread that holds it waits for the reader's lock, to take a message.
         When this returns, the previous eventfd is no longer used. Raises one of `RCL_ERRORS`.
         """
-        callback = None if eventfd is None else _ADD_TO_EVENTFD
+        callback = None if eventfd is None else ADD_TO_EVENTFD
         # rmw_fastrtps counts waiting messages, then begins to listen: only a second call counts those in between.
         for _ in range(1 if eventfd is None else 2):
             if _set_callback(self.handle.pointer, callback, eventfd):

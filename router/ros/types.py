@@ -61,10 +61,7 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
             message_class = class_for_cdr(package, kind, short, definitions)
         if message_class is not None and _other_library(package, message_class) is None:
             return message_class
-    for part, compiled in definitions.items():
-        installed = tuple(installed_class(part).get_fields_and_field_types().items())
-        if installed != compiled:
-            raise _mismatch(part, installed, compiled)
+    _require_same(definitions)
     if message_class is not None:
         return message_class
     message_class = loaded_class(name)
@@ -75,6 +72,25 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
             "run 'make setup', which removes the ignored one" if is_ignored else "source only one of them",
         )
     return message_class
+
+
+def service_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
+    """Return the class of `std_srvs/srv/SetBool`. Raises StartError as `checked_class` does."""
+    try:
+        _require_same(definitions)
+        package, kind, short = _parts(name)
+        with lazy_import("numpy"):
+            return getattr(importlib.import_module(f"{package}.{kind}"), short)
+    except StartError as error:
+        raise type(error)(f"{span}: {error.what}", error.hint) from error
+
+
+def _require_same(definitions: Mapping[str, Definition]) -> None:
+    """Raise StartError unless these types are installed with such fields."""
+    for part, compiled in definitions.items():
+        installed = tuple(installed_class(part).get_fields_and_field_types().items())
+        if installed != compiled:
+            raise _mismatch(part, installed, compiled)
 
 
 def _other_library(package: str, message_class: Any) -> Path | None:

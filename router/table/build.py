@@ -37,6 +37,7 @@ from router.table.model.gateways import (
 )
 from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
 from router.table.model.serial import Checksum, ChecksumKind, SerialLine, StreamFraming
+from router.table.model.services import Service, ServiceRequest
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
 from router.table.model.targets import Destination, Topic
@@ -120,12 +121,13 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         routes_span=routes.key.span if routes else None,
         gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, Gateway)},
         ignored_gateways={name: gateway for name, gateway in gateways.items() if isinstance(gateway, IgnoredGateway)},
-        broken=frozenset(builder.broken),
         record=builder.one(root, "record", _record),
         foxglove=builder.one(root, "foxglove", _server),
         reload_on_change=builder.one(root, "reload", _reload) or False,
         networks=builder.one(root, "networks", _networks),
         states=builder.each(root, "state", _state),
+        services=builder.each(root, "services", _service),
+        broken=frozenset(builder.broken),  # last: the others add to it
     )
 
 
@@ -283,6 +285,15 @@ def _state(entry: Entry) -> State:
     settings = mapping(entry.value)
     topic = _topic(settings, settings.entries["topic"].key.span) if settings.get("topic") else None
     return structure(State, settings, name=entry.key.text, span=entry.key.span, topic=topic)
+
+
+def _service(entry: Entry) -> Service:
+    settings = mapping(entry.value)
+    asked = settings.entries["request"]
+    request = structure(ServiceRequest, mapping(asked.value), **_without_ttl(mapping(asked.value)), span=asked.key.span)
+    on_timeout = _constants(settings.entries["on_timeout"])
+    given = {"name": entry.key.text, "span": entry.key.span}
+    return structure(Service, settings, **given, request=request, on_timeout=on_timeout)
 
 
 def _envelope(entry: Entry) -> EnvelopeSettings:

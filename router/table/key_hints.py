@@ -196,6 +196,8 @@ def _owners(name: str, path: Path) -> str:
     ]
     if path and path[0] == "listen" and "listener" in owners:
         return "remove it: a listener with 'address' and one with 'serial' have different keys"
+    if path[:1] != ("services",):
+        owners = [owner for owner in owners if not owner.startswith("service")]
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
     named = [_NAMES[owner] for owner in near]
     named += ["the top level"] if name in keys_of(table_schema()) else []
@@ -204,6 +206,7 @@ def _owners(name: str, path: Path) -> str:
 
 _OF_PART = {
     "routes": ("route", "destination", "topic"),
+    "services": ("service", "service_request", "service_reply"),
     "gateways": ("gateway", "inbound", "transport", "zenoh", "topic_pattern", "inbound_deadman"),
 }
 """Definitions where a key belongs that is misplaced in this part of a table."""
@@ -220,6 +223,9 @@ _NAMES = {
     "literal_text": "the value of a field",
     "qos": "'qos'",
     "state": "a state",
+    "service": "a service",
+    "service_request": "the 'request' of a service",
+    "service_reply": "the 'reply' of a service",
     "listener": "a listener",
     "stream_framing": "'framing' of a serial line",
     "checksum": "'checksum' of a serial line",
@@ -244,7 +250,7 @@ def for_value(error: SchemaError) -> str:
             takes_reason = error.path[-1] == "ttl" and error.path[0] != "defaults"
             return "write `ttl: {none: why}`" if takes_reason else f"leave '{error.path[-1]}' out"
         return as_variable(value) or _locator(value, error) or _meant_quantity(value, pattern)
-    if error.keyword == "maximum" and matches(EACH, str(error.schema.get("pattern", ""))):
+    if error.keyword == "maximum" and matches(EACH, str(error.schema.get("pattern", "never"))):
         return _MOST_OFTEN[1]
     if error.keyword == "const" and value == str(error.limit):
         return f"write it without quotes: {value}"

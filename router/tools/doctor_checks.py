@@ -270,7 +270,7 @@ def lines(program: CompiledTable) -> Iterator[CheckResult]:
 
 def ros_ports(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     """Check that no listener or gateway has a UDP port that ROS uses."""
-    uses_ros = bool(program.publishers or program.subscriptions or program.gateways)
+    uses_ros = program.uses_ros
     for clash in clashes(program, variables):
         grade = problem if clash.blinds and uses_ros and discovers_by_multicast(variables) else warning
         yield grade("ports", str(clash), BELOW_ROS)
@@ -474,7 +474,7 @@ DISCOVERY_S = 2.0
 
 def ros_peers(program: CompiledTable) -> Iterator[CheckResult]:
     """Warn of what a router would meet in the ROS domain: another router, and peers of another type."""
-    if not (program.publishers or program.subscriptions or program.gateways):
+    if not program.uses_ros:
         return
     from router.ros.graph import look_once
 
@@ -542,7 +542,7 @@ def page(name: str) -> str:
 
 def open_domain(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     """Warn if the ROS domain is open to the networks of this computer."""
-    if not (program.publishers or program.subscriptions or program.gateways):
+    if not program.uses_ros:
         return
     if variables.get("ROS_DOMAIN_ID", "") not in ("", "0") or not discovers_by_multicast(variables):
         return

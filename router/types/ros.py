@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,8 @@ from router.types.model import Bool, Field, Float, Int, List, MessageType, Strin
 from router.types.msg import PRIMITIVES, MsgDefinition, MsgError, parse_msg
 
 _TYPE_NAME = re.compile(r"(?P<package>[a-z]\w*)/msg/(?P<name>[A-Z]\w*)", re.ASCII)
+_HALF_NAME = re.compile(r"(?P<package>[a-z]\w*)/srv/(?P<name>[A-Z]\w*)_(?P<half>Request|Response)", re.ASCII)
+_HALVES = ("Request", "Response")
 _PLACEHOLDER = "structure_needs_at_least_one_member"
 
 IGNORED = "COLCON_IGNORE"
@@ -42,32 +44,58 @@ class FoundDefinition:
     definition: MsgDefinition
 
 
+STD_SRVS: Mapping[str, str] = {
+    "Empty": "---\n",
+    "SetBool": "bool data\n---\nbool success\nstring message\n",
+    "Trigger": "---\nbool success\nstring message\n",
+}
+"""The services of the package std_srvs, for machines without ROS: rosbags has messages only."""
+
+
 class MsgFiles:
-    """The `.msg` files of installed packages: `share/<package>/msg/<Name>.msg` below each of `folders`."""
+    """The definitions of installed packages, below each of `folders`.
+
+    They are `share/<package>/msg/<Name>.msg`, and `share/<package>/srv/<Name>.srv`, which has two messages.
+    """
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._folders = folders
 
     def find(self, name: str) -> FoundDefinition | None:
-        """Find a definition by full name, `sensor_msgs/msg/Imu`. Raises TableError for an invalid file."""
-        parts = _TYPE_NAME.fullmatch(name)
-        if parts is None:
-            return None
-        for folder in self._folders:
-            package = folder / parts["package"]
-            path = package / "msg" / f"{parts['name']}.msg"
-            if inputs.is_file(path) and not inputs.exists(package / IGNORED):
-                return _read(path, parts["package"])
+        """Find a definition by full name: `sensor_msgs/msg/Imu`, or `std_srvs/srv/SetBool_Request`.
+
+        Raises TableError for an invalid file.
+        """
+        if parts := _TYPE_NAME.fullmatch(name):
+            path = self._file(parts["package"], "msg", parts["name"])
+            return _read(path, parts["package"]) if path else None
+        if parts := _HALF_NAME.fullmatch(name):
+            path = self._file(parts["package"], "srv", parts["name"])
+            if path is not None:
+                return _read(path, parts["package"], parts["half"])
+            if parts["package"] == "std_srvs" and parts["name"] in STD_SRVS:
+                text = _half(STD_SRVS[parts["name"]], parts["half"])
+                return FoundDefinition("<std_srvs>", parse_msg("std_srvs", text))
         return None
 
-    def names(self) -> Iterator[str]:
+    def _file(self, package: str, kind: str, name: str) -> Path | None:
+        for folder in self._folders:
+            path = folder / package / kind / f"{name}.{kind}"
+            if inputs.is_file(path) and not inputs.exists(folder / package / IGNORED):
+                return path
+        return None
+
+    def names(self, kind: str = "msg") -> Iterator[str]:
+        """Yield the names of all messages, or of all services (`srv`)."""
         for folder in self._folders:
             packages = inputs.listing(folder)[0]
             for package in (name for name in packages if not inputs.exists(folder / name / IGNORED)):
-                for file in inputs.listing(folder / package / "msg")[1]:
+                for file in inputs.listing(folder / package / kind)[1]:
                     name, _, ending = file.rpartition(".")
-                    if ending == "msg":
-                        yield f"{package}/msg/{name}"
+                    if ending == kind:
+                        yield f"{package}/{kind}/{name}"
+        if kind == "srv":
+            yield from (f"std_srvs/srv/{name}" for name in STD_SRVS)
 
 
 def msg_files() -> MsgFiles:
@@ -82,9 +110,18 @@ def msg_files() -> MsgFiles:
     return MsgFiles([*shares, ours] if is_installed(ours) else [ours, *shares])
 
 
-def _read(path: Path, package: str) -> FoundDefinition:
+def _half(text: str, half: str) -> str:
+    """Return the request or the response of a service. The response keeps the numbers of its lines."""
+    lines = text.splitlines()
+    between = next((number for number, line in enumerate(lines) if line.strip() == "---"), len(lines))
+    return "\n".join(lines[:between] if half == "Request" else ["#"] * (between + 1) + lines[between + 1 :])
+
+
+def _read(path: Path, package: str, half: str = "") -> FoundDefinition:
+    """Read a message, or `half` of a service. Raises TableError for an invalid file."""
     try:
-        return FoundDefinition(shown_path(path), parse_msg(package, inputs.read_text(path)))
+        text = inputs.read_text(path)
+        return FoundDefinition(shown_path(path), parse_msg(package, _half(text, half) if half else text))
     except MsgError as error:
         span = SourceSpan(shown_path(path), error.line, error.column, error.end_column)
         raise TableError.of(span, Code.BAD_FILE, error.message) from None
@@ -159,9 +196,21 @@ class RosInterfaces:
         """
         return self._get(name, ())
 
+    def service(self, name: str) -> tuple[MessageType, MessageType] | None:
+        """Return the request and the response of `std_srvs/srv/SetBool`, None if it does not exist.
+
+        Raises TableError as `get` does.
+        """
+        request, response = (self.get(f"{name}_{half}") for half in _HALVES)
+        return (request, response) if request is not None and response is not None else None
+
     def names(self) -> Collection[str]:
-        """Return every name that `get` accepts, for hints. Slow: lists folders."""
+        """Return every name of a message that `get` accepts, for hints. Slow: lists folders."""
         return {*self._files.names(), *self._rosbags.names()}
+
+    def services(self) -> Collection[str]:
+        """Return every name that `service` accepts, likewise."""
+        return {*self._files.names("srv")}
 
     def _get(self, name: str, inside: tuple[str, ...]) -> MessageType | None:
         if name not in self._known:

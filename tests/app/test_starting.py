@@ -231,7 +231,7 @@ def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -
     code, said = ended("run", table, path=str(without))
     assert code == 78
     assert "\n".join(said) == (
-        f"router run: {table} has topics, and ROS 2 cannot be loaded: No module named 'rclpy'\nhelp: "
+        f"router run: {table} has topics or services, and ROS 2 cannot be loaded: No module named 'rclpy'\nhelp: "
         "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
     )
 

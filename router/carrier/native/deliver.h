@@ -35,7 +35,8 @@
 enum wanted {
     NOTHING,       /* no subscriber */
     EVERY_MESSAGE,
-    NEWEST_MESSAGE /* all subscribers are gateways of this router that look only now and then: the newest is published then */
+    NEWEST_MESSAGE, /* all subscribers are gateways of this router that look only now and then: the newest is published then */
+    EVERY_REPLY     /* it is a service: each reply is handed to Python */
 };
 
 /* What the subscribers of a topic want. Belongs to the owner of its publisher. */
@@ -46,7 +47,7 @@ struct demand {
     struct held *held;  /* the newest message; for the publish thread */
 };
 
-/* A topic that any number of routes publish on. */
+/* A topic that any number of routes publish on; or a service, which gets replies, and has no publisher. */
 struct topic {
     const void *publisher; /* rcl_publisher_t */
     struct demand *demand;

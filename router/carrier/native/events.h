@@ -18,7 +18,8 @@ enum event_kind {
     EVENT_RETURNED,
     EVENT_STATE,
     EVENT_LINK,
-    EVENT_LEARNED
+    EVENT_LEARNED,
+    EVENT_REPLY
 };
 
 /* The beginning of every event. */
@@ -79,6 +80,11 @@ struct link_event {
     uint32_t size, kind; /* EVENT_LINK: a link was opened, was closed, or cannot be opened */
     uint32_t listener;
     int32_t error;       /* errno: why it is closed; 0 if it is open */
+};
+
+struct reply_event {
+    uint32_t size, kind;     /* EVENT_REPLY: a reply for a service; the message follows */
+    uint32_t target, length; /* `target`: as in other events; `length`: of the message */
 };
 
 /* Details of a loss, with numbers in `values` of a struct refusal. If there is a text, its beginning follows the event. */

@@ -34,6 +34,10 @@ struct publish_thread {
     /* For the thread: */
     struct held *held, *spare;
     struct ring *ring;
+    struct {
+        struct reply_event event;
+        uint8_t message[MAX_DATAGRAM + 8];
+    } reply;
     _Alignas(8) uint8_t records[2 * sizeof(struct message_record) + MAX_DATAGRAM + 8];
 };
 
@@ -107,12 +111,32 @@ static void supersede(struct publish_thread *thread, struct demand *demand) {
     __atomic_add_fetch(&demand->replaced, 1, __ATOMIC_RELAXED);
 }
 
+/* Give a reply to Python. The message of a service is its response, after a number. */
+static enum publication hand_over(struct publish_thread *thread, const struct target *target, const char **why) {
+    const struct output *message = &thread->env.machine.output;
+    struct reply_event *event = &thread->reply.event;
+    if (message->size > MAX_DATAGRAM) {
+        *why = "the response is too long";
+        return PUBLISH_FAILED;
+    }
+    *event = (struct reply_event){.size = padded_to_word(sizeof *event + message->size), .kind = EVENT_REPLY,
+                                  .target = target->id, .length = (uint32_t)message->size};
+    memcpy(thread->reply.message, message->data, message->size);
+    if (ring_put(thread->env.reporter.events, event, event->size)) return PUBLISHED;
+    *why = "the router is too slow to answer the calls";
+    return PUBLISH_FAILED;
+}
+
 /* Publish the written message, without the lock. The counters balance meanwhile, as the message counts as waiting. */
 static enum publication publish_written(struct thread_env *env, const struct targets *to, const struct target *target,
                                         const char **why) {
     struct publish_thread *thread = (struct publish_thread *)env;
     struct demand *demand = target->topic->demand;
-    if (wanted_of(target->topic) == NEWEST_MESSAGE && hold(thread, to, target)) return PUBLISHED;
+    uint8_t wanted = wanted_of(target->topic);
+    if (wanted > EVERY_MESSAGE) {
+        if (wanted == EVERY_REPLY) return hand_over(thread, target, why);
+        if (hold(thread, to, target)) return PUBLISHED;
+    }
     if (demand->held) supersede(thread, demand);
     edition_end(&thread->edition);
     *why = publish_unlocked(&thread->publishing, &thread->lock, target->topic->publisher, target->id, &env->machine.output);

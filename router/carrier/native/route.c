@@ -61,7 +61,7 @@ static enum wanted most_wanted(const struct targets *to) {
     enum wanted most = NOTHING;
     for (uint32_t index = 0; index < to->count; index++) {
         uint8_t wanted = wanted_of(to->targets[index].topic);
-        if (wanted == EVERY_MESSAGE || (wanted && to->ttl)) return EVERY_MESSAGE;
+        if (wanted && (wanted != NEWEST_MESSAGE || to->ttl)) return EVERY_MESSAGE;
         if (wanted) most = NEWEST_MESSAGE;
     }
     return most;

@@ -143,6 +143,20 @@ _KEYS: Schema = {
             "additionalProperties": ref("state"),
         },
     ),
+    "services": key(
+        "Services",
+        "ROS services that boards answer: a call becomes a message to a board, and the board's reply the response. By "
+        "the name of the service in ROS, which is resolved in the node's namespace.",
+        {
+            "default": {},
+            "type": "object",
+            "propertyNames": {
+                "pattern": "^(?:~/|/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*$",
+                "errorMessage": "must be the name of a ROS service: letters, digits and '_', with '/' between parts",
+            },
+            "additionalProperties": ref("service"),
+        },
+    ),
     "routes": key(
         "Routes",
         "What happens to each payload case of the envelope, by its name in the proto. Every case has a route, a list "

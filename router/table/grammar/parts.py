@@ -9,6 +9,7 @@ from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
 from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
 from router.table.model.serial import SerialLine
+from router.table.model.services import Service, ServiceReply, ServiceRequest
 from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
@@ -205,6 +206,9 @@ PARTS: Schema = {
     "listener": _LISTENER,
     "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,
+    "service": part(Service),
+    "service_request": part(ServiceRequest),
+    "service_reply": part(ServiceReply),
     "case": _CASE,
     "route": _ROUTE,
     "deadman": {

@@ -10,6 +10,7 @@ from router.table.grammar.keys import Schema, key, ref, required
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Transport, ZenohSettings
 from router.table.model.routes import Collect
+from router.table.model.services import Service, ServiceReply, ServiceRequest
 from router.table.model.settings import RecordSettings
 from router.table.model.state import State
 
@@ -92,6 +93,15 @@ COMPLETE: Schema = {
                     "if": {"required": ["topic"]},
                     "then": {"required": ["type"]},
                     "else": {"required": ["case", "source"]},
+                }
+            ),
+            "services": _each(
+                {
+                    "required": [*required(Service), "request", "reply"],
+                    "properties": {
+                        "request": {"required": required(ServiceRequest)},
+                        "reply": {"required": required(ServiceReply)},
+                    },
                 }
             ),
             "routes": _each(ref("complete_route")),

@@ -1,0 +1,313 @@
+"""Checks services: each is a route from ROS, which sends its requests, and a target of the route of its replies.
+
+In the carrier, request and response are messages with a number before them: of a request, the number of the call, and
+of a response, the value of `match`. It takes eight bytes, so whatever follows keeps its layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from router.compiler.checked import CheckedRoute, CheckedService, Target
+from router.compiler.compiled_table import MOST_CALLS, OUTCOMES, service_label
+from router.compiler.constants import cdr_of
+from router.compiler.conversion import convert
+from router.compiler.expressions import Scope
+from router.compiler.expressions.kinds import IntKind, StringKind
+from router.compiler.expressions.scope import field_of
+from router.compiler.expressions.tree import ENVELOPE, Constant, Node, Read, Variable
+from router.compiler.lookup import Lookup
+from router.compiler.mapping import FieldMapping, Row, build
+from router.compiler.plan import Plan, Record, Unset
+from router.compiler.routes import destinations, subscription
+from router.compiler.topics import resolved
+from router.errors import Code, Diagnostic, FindingError, Located, SourceSpan, TableError, did_you_mean
+from router.table.model.endpoints import EndpointKind
+from router.table.model.routes import ANY, Route
+from router.table.model.services import Service
+from router.table.model.targets import Destination, Topic
+from router.table.units import duration
+from router.types.model import Field, Int, MessageType
+from router.types.protobuf import PayloadCase
+
+SEQUENCE, REASON = "sequence", "reason"
+"""Names in `fields` of a request, and in `on_timeout`."""
+
+_NOTHING = MessageType("nothing")
+
+
+def check_services(
+    lookup: Lookup, routes: Sequence[CheckedRoute]
+) -> tuple[tuple[CheckedService, ...], tuple[CheckedRoute, ...]]:
+    """Check the services of the table. Return them, and all routes with theirs; findings go to `lookup`."""
+    services: list[CheckedService] = []
+    all_routes = list(routes)
+    for declared in lookup.table.services.values():
+        if (checked := _checked(lookup, declared)) is None:
+            continue
+        service, reply = checked
+        services.append(service)
+        all_routes.append(service.request)
+        _add(lookup, all_routes, service, reply)
+    lookup.findings += _ambiguous(services)
+    return tuple(services), tuple(all_routes)
+
+
+def _checked(lookup: Lookup, declared: Service) -> tuple[CheckedService, Target] | None:
+    request_case, reply_case = lookup.case(declared.request.case), lookup.case(declared.reply.case)
+    endpoints = [lookup.endpoint(name) for name in filter(None, (declared.request.to, declared.reply.sender))]
+    if request_case is None or reply_case is None or None in endpoints:
+        return None
+    halves = _type(lookup, declared.type)
+    if halves is None:
+        return None
+    lookup.findings += [*_age_findings(lookup, declared), *_brake_findings(lookup, declared)]
+    request = _request(lookup, declared, request_case, halves[0])
+    match = _match(lookup, declared, reply_case)
+    if match is not None:
+        lookup.findings += _match_findings(lookup, declared, request, match)
+    reply = _reply(lookup, declared, reply_case, halves[1], match)
+    responses = _responses(lookup, declared, halves[1])
+    if declared.reply.match is not None and match is None:
+        return None
+    path = _path(match) if match is not None else None
+    name = resolved(declared.name, lookup.table.node)
+    return CheckedService(declared, name, *halves, request, reply_case, path, responses), reply
+
+
+def _type(lookup: Lookup, name: Located[str]) -> tuple[MessageType, MessageType] | None:
+    """Return the request and the response of a service type, or None with a finding."""
+    interfaces = lookup.definitions.interfaces
+    try:
+        halves = interfaces.service(name.value)
+    except TableError as error:
+        lookup.findings += error.diagnostics
+        return None
+    if halves is None and "/msg/" in name.value:
+        message, hint = f"'{name.value}' is a message, not a service", "write a type such as std_srvs/srv/SetBool"
+        lookup.report(name.span, Code.UNKNOWN_ROS_TYPE, message, hint)
+    elif halves is None:
+        hint = did_you_mean(name.value, interfaces.services())
+        lookup.report(name.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS service type '{name.value}'", hint)
+    return halves
+
+
+# requests
+
+
+def _request(lookup: Lookup, declared: Service, case: PayloadCase, message: MessageType) -> CheckedRoute:
+    """Return the route of the requests, whose topic is the service."""
+    asked, label = declared.request, service_label(declared.name)
+    topic = Topic(Located(label, declared.span), declared.span, type=Located(message.name, declared.type.span))
+    route = Route(
+        name=label,
+        span=asked.span,
+        case=asked.case,
+        source_topics=(topic,),
+        destinations=(Destination(asked.to, asked.to.span),),
+        fields=asked.fields,
+        ttl=asked.ttl,
+        no_ttl=asked.no_ttl,
+    )
+    numbered = _numbered(message, Int(64, signed=False))
+    before = len(lookup.findings)
+    recipients, names = destinations(lookup, route, case), {SEQUENCE: _sequence(numbered, declared.span)}
+    feed = subscription(lookup, route, case, topic, message, recipients, numbered, names)
+    if not message.fields:  # then nothing can fill the payload
+        lookup.findings[before:] = [each for each in lookup.findings[before:] if each.code is not Code.NOTHING_MAPPED]
+    targets = tuple(replace(each, deadmen=(), is_request=True) for each in feed.targets) if feed else ()
+    return CheckedRoute(route, case, subscriptions=(replace(feed, targets=targets),) if feed else ())
+
+
+def _sequence(numbered: MessageType, span: SourceSpan) -> Node:
+    scope = Scope(numbered, (), ())
+    return replace(field_of(scope.whole_message(span), numbered.fields[0], span), kind=IntKind(1, MOST_CALLS))
+
+
+def _numbered(message: MessageType, number: Int) -> MessageType:
+    """Return the message with a number before it. Its name is no name of a field, so expressions cannot read it."""
+    fields = message.fields or (Field("structure_needs_at_least_one_member", Int(8, signed=False)),)
+    return MessageType(message.name, (Field("(number)", number), *fields), message.constants)
+
+
+def _age_findings(lookup: Lookup, declared: Service) -> Iterator[Diagnostic]:
+    asked = declared.request
+    if asked.to.value in lookup.boards and asked.ttl is None and asked.no_ttl is None:
+        message = f"calls that waited in a queue or a stopped process still command '{asked.to.value}'"
+        yield Diagnostic(asked.span, Code.NO_TTL, message, "add `ttl: 200ms`, or `ttl: {none: why}`")
+
+
+def _brake_findings(lookup: Lookup, declared: Service) -> Iterator[Diagnostic]:
+    """Yield a warning if the board is stopped by a deadman, which does not know of calls."""
+    to = declared.request.to.value
+    endpoint = lookup.table.endpoints.get(to)
+    if declared.because is not None or endpoint is None or endpoint.kind is not EndpointKind.BOARD:
+        return
+    for route in lookup.table.routes:
+        if route.deadman is not None and to in [each.value for each in route.deadman.to]:
+            message = (
+                f"calls command '{to}', but they do not feed the deadman of '{route.name}', which stops this board: "
+                "it does not stop what a call begins"
+            )
+            hint = "if a call moves nothing, add `because: why`; commands that move something need a route"
+            yield Diagnostic(declared.request.to.span, Code.DOUBTFUL_DEADMAN, message, hint)
+            return
+
+
+# replies
+
+
+def _match(lookup: Lookup, declared: Service, case: PayloadCase) -> Node | None:
+    """Return the field of the reply that `match` names; None without one, or with a finding."""
+    expression = declared.reply.match
+    if expression is None:
+        return None
+    wanted, hint = "'match' takes an integer field", "name one, such as envelope.req_id"
+    node = lookup.value(expression, lookup.received(case), (IntKind,), wanted, hint)
+    if node is not None and _path(node) is None:
+        message = "'match' takes a field of the envelope or of the payload, which request and reply have in common"
+        lookup.report(node.span, Code.BAD_VALUE, message, hint)
+        return None
+    return node
+
+
+def _path(node: Node) -> tuple[str, ...] | None:
+    """Return the names of a field, with ENVELOPE before those of the envelope; None for anything else."""
+    if isinstance(node, Variable):
+        return (ENVELOPE,) if node.name == ENVELOPE else ()
+    around = _path(node.holder) if isinstance(node, Read) else None
+    return (*around, node.field.name) if around is not None and isinstance(node, Read) else None
+
+
+def _match_findings(lookup: Lookup, declared: Service, request: CheckedRoute, match: Node) -> Iterator[Diagnostic]:
+    """Yield a finding if a request does not have a number of its own in the field that `match` names."""
+    path, to = _path(match) or (), declared.request.to.value
+    name = ".".join(path)
+    if path[:1] == (ENVELOPE,):
+        rows: Sequence[Row] = lookup.beside[to].rows if to in lookup.beside else ()
+        hint = f"write `set: {{{'.'.join(path[1:])}: {SEQUENCE}}}` in the endpoint '{to}'"
+        endpoint = lookup.table.endpoints.get(to)
+        is_known = endpoint is not None and (endpoint.beside is None or to in lookup.beside)
+    else:
+        targets = [target for feed in request.subscriptions for target in feed.targets]
+        rows = [row for target in targets for row in target.rows]
+        hint = f"fill it in 'fields' of the request, for example `{name}: {SEQUENCE}`"
+        is_known = bool(targets)
+        if _field(request.case.type, path) is None:
+            message = f"'{request.case.name}' has no integer field '{name}' to compare with that of the reply"
+            yield Diagnostic(match.span, Code.UNKNOWN_FIELD, message, "both need a field of this name")
+            return
+    what = _why_alike(next((row for row in rows if row.target == name), None))
+    if is_known and what:  # otherwise there is a finding already
+        message = f"{what} '{name}' in the requests, so replies cannot be told apart"
+        yield Diagnostic(match.span, Code.BAD_VALUE, message, hint)
+
+
+def _why_alike(filling: Row | None) -> str:
+    """Return why a field has the same value in all requests; empty if it does not."""
+    if filling is None:
+        return "nothing fills"
+    is_constant = filling.kind.startswith("int ") and ".." not in filling.kind
+    return "the same value fills" if is_constant else ""
+
+
+def _field(message: MessageType, path: Sequence[str]) -> Field | None:
+    """Return the integer field at a path, None if there is none."""
+    found = None
+    for name in path:
+        found = message.field(name)
+        if found is None:
+            return None
+        message = found.type if isinstance(found.type, MessageType) else _NOTHING
+    return found if found is not None and isinstance(found.type, Int) else None
+
+
+def _reply(lookup: Lookup, declared: Service, case: PayloadCase, message: MessageType, match: Node | None) -> Target:
+    """Return the target that gets the replies: the response, after the value of `match`."""
+    label, reply = service_label(declared.name), declared.reply
+    sources = (reply.sender or declared.request.to,)
+    scope = lookup.received(case, message, route=Route(label, reply.span, reply.case, sources=sources))
+    mapping = _mapped(build(reply.fields, message, scope, reply.span, None, message), message)
+    lookup.findings += mapping.findings
+    number = Int(64, signed=isinstance(match, Read) and isinstance(match.kind, IntKind) and match.kind.low < 0)
+    numbered = _numbered(message, number)
+    leading: Plan = convert(match, number, scope) if match is not None else Unset(number, None, reply.span)
+    fillers = mapping.plan.members or ((numbered.fields[1], Unset(numbered.fields[1].type, None, reply.span)),)
+    plan = Record(numbered, ((numbered.fields[0], leading), *fillers), reply.span)
+    topic = Topic(Located(label, reply.span), reply.span, type=Located(message.name, declared.type.span))
+    return Target(topic, type=numbered, plan=plan, rows=tuple(mapping.rows))
+
+
+def _mapped(mapping: FieldMapping, message: MessageType) -> FieldMapping:
+    """Return the mapping; a response without fields needs none."""
+    return mapping if message.fields else replace(mapping, findings=[])
+
+
+def _add(lookup: Lookup, routes: list[CheckedRoute], service: CheckedService, reply: Target) -> None:
+    """Add the target of replies to the route that takes them, or add a route."""
+    declared, case = service.declared.reply, service.reply_case
+    sender = declared.sender or service.declared.request.to
+    same = [index for index, each in enumerate(routes) if each.case.name == case.name and not each.subscriptions]
+    for index in same:
+        route = routes[index].route
+        taken = [source.value for source in route.sources]
+        if route.ignore is not None:
+            message = f"'{case.name}' is ignored, so no reply arrives"
+            lookup.report(declared.case.span, Code.BAD_VALUE, message, f"remove `ignore`: see {route.span}")
+            return
+        if route.collect is not None and sender.value in taken:
+            message = f"a route collects '{case.name}' from '{sender.value}' into frames, so no reply arrives alone"
+            lookup.report(declared.case.span, Code.SOURCE_CLASH, message, f"remove `collect`: see {route.span}")
+            return
+        if taken == [sender.value]:
+            routes[index] = replace(routes[index], targets=(*routes[index].targets, reply))
+            return
+        if sender.value in taken or ANY in taken:
+            message = f"a route takes '{case.name}' from '{sender.value}' and others"
+            hint = f"write a list of routes, one of them only from '{sender.value}': see {route.span}"
+            lookup.report(declared.case.span, Code.SOURCE_CLASH, message, hint)
+            return
+    names = {each.route.name for each in routes}
+    name = case.name if not names & {case.name} else f"{case.name}_from_{sender.value}"
+    route = Route(name=name, span=declared.span, case=declared.case, sources=(sender,))
+    routes.append(CheckedRoute(route, case, (reply,)))
+
+
+def _ambiguous(services: Iterable[CheckedService]) -> Iterator[Diagnostic]:
+    """Yield a finding for each service whose replies may be those of another one."""
+    groups: dict[tuple[str, str], list[CheckedService]] = {}
+    for service in services:
+        groups.setdefault(service.group, []).append(service)
+    for (case, sender), several in groups.items():
+        for service in several[1:]:
+            if service.match is None or service.match != several[0].match:
+                message = f"'{case}' from '{sender}' also answers '{several[0].declared.name}'"
+                hint = "give both services the same `match`, so that their replies can be told apart"
+                yield Diagnostic(service.declared.reply.span, Code.BAD_VALUE, message, hint)
+
+
+# responses that the router gives itself
+
+
+def _responses(lookup: Lookup, declared: Service, message: MessageType) -> Mapping[str, bytes]:
+    """Return the response for each outcome but a reply."""
+    texts = {
+        outcome: text.format(endpoint=declared.request.to.value, timeout=duration(declared.timeout.value))
+        for outcome, text in OUTCOMES.items()
+    }
+    responses: dict[str, bytes] = {}
+    for outcome, text in texts.items():
+        names = {REASON: Constant(StringKind(), declared.span, text)}
+        scope = replace(lookup.scope(_NOTHING, message, names), given=())
+        mapping = build(declared.on_timeout, message, scope, declared.on_timeout.span)
+        findings = [each for each in mapping.findings if each.code is not Code.NOTHING_MAPPED]
+        if findings:  # the same for each outcome
+            lookup.findings += findings
+            return {}
+        try:
+            responses[outcome] = cdr_of(mapping.plan)
+        except FindingError as error:
+            lookup.findings.append(error.diagnostic)
+            return {}
+    return responses

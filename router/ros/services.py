@@ -1,0 +1,77 @@
+"""Services of the node, whose requests and responses are CDR bytes."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any, NamedTuple
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
+
+from router.clock import wall_ns
+from router.compiler.compiled_table import ServicePlan
+from router.ros.node import RCL_ERRORS, start_error
+from router.ros.rcl import RCL
+from router.ros.receiving import ADD_TO_EVENTFD
+from router.ros.types import service_class
+
+MOST_WAITING = 1000
+"""Requests that wait to be taken, and responses that wait for their clients, of all clients together. ROS keeps 10 by
+default, and loses the others without a word.
+"""
+
+_set_callback = RCL.rcl_service_set_on_new_request_callback
+_set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+
+
+class Request(NamedTuple):
+    """A request that a client sent at `called_at` (wall clock, ns). `header` identifies it for the response."""
+
+    message: bytes
+    header: Any
+    called_at: int
+
+
+class ServedService:
+    """A service of the node. Requests add to an eventfd. For one thread."""
+
+    def __init__(self, node: Node, plan: ServicePlan, eventfd: int) -> None:
+        """Open the service. Raises StartError if its type is not installed, or the middleware refuses it."""
+        self.plan = plan
+        self._node = node
+        self._type = service_class(plan.type_name, plan.definitions, plan.span)
+        try:
+            self._service = node.create_service(
+                self._type,
+                plan.name,
+                lambda _, response: response,  # not called without an executor
+                qos_profile=QoSProfile(depth=MOST_WAITING),
+                callback_group=ReentrantCallbackGroup(),  # the node's own group would leak memory
+            )
+            for _ in range(2):  # see RawSubscription.announce_to
+                if _set_callback(self._service.handle.pointer, ADD_TO_EVENTFD, eventfd):
+                    raise rclpy_implementation.RCLError("the middleware does not report new requests")
+        except RCL_ERRORS as error:
+            raise start_error(error, f"{plan.span}: service '{plan.name}' cannot be opened: {error}") from error
+
+    def take(self) -> Request | None:
+        """Return the oldest request; None if there is none. Raises one of RCL_ERRORS."""
+        handle = self._service.handle
+        with handle:
+            request, header = handle.service_take_request(self._type.Request)
+        if request is None:
+            return None
+        sent, received = header.source_timestamp, header.received_timestamp  # 0 if unknown to the middleware
+        called_at = min(sent or received, received or sent) or wall_ns()
+        return Request(serialize_message(request), header, called_at)
+
+    def answer(self, request: Request, response: bytes) -> None:
+        """Send a response. Raises one of RCL_ERRORS."""
+        self._service.send_response(deserialize_message(response, self._type.Response), request.header)
+
+    def close(self) -> None:
+        _set_callback(self._service.handle.pointer, None, None)
+        self._node.destroy_service(self._service)

@@ -1,0 +1,1 @@
+"""Calls of ROS services that endpoints answer."""
