@@ -145,6 +145,18 @@ _WITHHELD = "They do not meet a condition (`when`) of the table: `router explain
 _SILENT_LINE = (
     "Check its power, and the wires of {address}; compare `baud`, `framing` and `checksum` with its firmware's."
 )
+_NO_BRAKE_ON_LINE = (
+    "Stop the rover by other means. Check plug and power of {destination}, and that no other program has its serial "
+    "line: `fuser -v {address}`."
+)
+_ON_LINE: Mapping[str, str] = {
+    "send_error": "Its serial line is closed: check plug and power, and `fuser -v {address}`; the log says why.",
+    "send_buffer_full": (
+        "Its serial line is full. Does its firmware read? Else raise `baud` on both sides, give {target} a `bandwidth` "
+        "below it, or route less."
+    ),
+}
+"""Remedies for messages to the other end of a serial line that are dropped, by reason."""
 _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
@@ -327,7 +339,7 @@ class HealthSnapshot:
             return _OTHER_ADDRESS.format(endpoint=endpoint, address=address, sender=sender)
         if len(self._stale) == len(self._limits) > 1:
             return _ALL_SILENT
-        if isinstance(self.program.table.endpoints[endpoint].address.value, SerialPlace):
+        if self._is_on_line(endpoint):
             return _SILENT_LINE.format(address=address)
         if not address:
             return _NOT_LEARNED.format(endpoint=endpoint)
@@ -525,7 +537,14 @@ class HealthSnapshot:
             return _STALE_FROM_ROS
         if reason == "send_error" and target in self.program.table.endpoints and not self._senders.host(target):
             return self._remedy_for_silence(target)
+        if self._is_on_line(target) and reason in _ON_LINE:
+            return _ON_LINE[reason].format(target=target, address=self._senders.host(target))
         return REMEDIES.get(reason, "").format(target=target)
+
+    def _is_on_line(self, target: str) -> bool:
+        """Return whether a target is the other end of a serial line."""
+        endpoint = self.program.table.endpoints.get(target)
+        return endpoint is not None and isinstance(endpoint.address.value, SerialPlace)
 
     @cached_property
     def _from_ros(self) -> set[str]:
@@ -550,5 +569,7 @@ class HealthSnapshot:
         elif (endpoint := table.endpoints.get(labels.get("endpoint") or labels.get("destination", ""))) is not None:
             host = self._senders.host(endpoint.name)
             address = self.address_of(endpoint) if "destination" in labels and host else host or "its address"
+            if kind is Kind.DEADMAN_CANNOT_SEND and self._is_on_line(endpoint.name):
+                return Problem(kind, labels, more, _NO_BRAKE_ON_LINE.format_map({**labels, "address": address}), routes)
         remedy = kind.remedy or REMEDIES.get(labels.get("reason") or labels.get("state", ""), "")
         return Problem(kind, labels, more, remedy.format_map({**labels, "address": address}), routes)

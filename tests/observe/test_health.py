@@ -599,6 +599,33 @@ def test_a_serial_line_that_is_closed_is_a_problem(tmp_path: Path) -> None:
     assert "the wires of /dev/ttyAMA0" in silent.remedy
 
 
+def test_remedies_for_a_board_on_a_serial_line_are_about_the_line(tmp_path: Path) -> None:
+    line = "  uart: {serial: /dev/ttyAMA0, baud: 9600, framing: cobs}\n"
+    head = HEAD.replace("endpoints:\n", f"{line}endpoints:\n  lander: {{listener: uart, kind: board}}\n")
+    deadman = "deadman: {timeout: 200ms, send: {manual_brake: {brake: true}}, to: [lander]}"
+    route = f"  manual_drive: {{source: basestation, destinations: [lander], {deadman}}}\n"
+    router = Counting(small_program(tmp_path, route, head))
+    router.look(1)
+    router.count("link_up", "uart", to=1)
+    router.count("deadman_send_errors", "manual_drive", "lander", to=3)
+    router.count("messages_dropped", "manual_drive", "lander", "send_error", to=3)
+    router.count("messages_dropped", "manual_drive", "lander", "send_buffer_full", to=3)
+    remedies = {each.labels.get("reason", each.kind.name): each.remedy for each in router.look(2).problems}
+    assert remedies == {
+        "DEADMAN_CANNOT_SEND": (
+            "Stop the rover by other means. Check plug and power of lander, and that no other program has its serial "
+            "line: `fuser -v /dev/ttyAMA0`."
+        ),
+        "send_error": (
+            "Its serial line is closed: check plug and power, and `fuser -v /dev/ttyAMA0`; the log says why."
+        ),
+        "send_buffer_full": (
+            "Its serial line is full. Does its firmware read? Else raise `baud` on both sides, give lander a "
+            "`bandwidth` below it, or route less."
+        ),
+    }
+
+
 @pytest.mark.parametrize("kind", Kind, ids=lambda kind: kind.alert)
 def test_every_kind_has_words_of_labels_of_its_metric(kind: Kind) -> None:
     if kind.metric:
