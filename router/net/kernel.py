@@ -266,6 +266,13 @@ def _rows(table: str) -> Iterator[list[str]]:
         yield from (line.split() for line in Path("/proc/net", table).read_text().splitlines()[1:])
 
 
+def processes_called(name: str) -> Iterator[Path]:
+    """Yield the processes of this name, as directories of /proc."""
+    from pathlib import Path
+
+    return (process for process in Path("/proc").glob("[0-9]*") if _name(process) == name)
+
+
 def open_files(process: Path) -> Iterator[str]:
     """Yield what the descriptors of a process refer to, of those that may be seen."""
     try:

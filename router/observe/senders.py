@@ -20,9 +20,7 @@ MOST_NAMED = 3
 class Senders:
     """The senders of `mismatches`, judged by a program. `learned` are the learned addresses, by endpoint."""
 
-    def __init__(
-        self, program: CompiledTable, mismatches: AbstractSet[Mismatch], learned: Mapping[str, str]
-    ) -> None:
+    def __init__(self, program: CompiledTable, mismatches: AbstractSet[Mismatch], learned: Mapping[str, str]) -> None:
         self._program = program
         self._learned = learned
         lines = {line.name: line.address.value.host for line in program.table.lines}  # the router sees no host there

@@ -22,7 +22,6 @@ from router.tools.doctor_checks import (
     endpoints,
     extras,
     fine,
-    lines,
     listeners,
     open_domain,
     page,
@@ -37,6 +36,7 @@ from router.tools.doctor_checks import (
     warning,
     ways,
 )
+from router.tools.line_checks import lines
 from router.tools.multicast_checks import groups
 from router.tools.name_checks import Names
 from router.tools.running_router import Health, health, url_of
@@ -57,7 +57,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
         yield from ros_peers(program)
     yield from listeners(program)
     yield from groups(program)
-    yield from lines(program)
+    yield from lines(program, running=running is not None)
     yield from ports(program, running=running is not None)
     yield from ros_ports(program, variables)
     yield from receive_buffers(program)
@@ -73,7 +73,8 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
 
 
 def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Yield only what would make the start fail, and warnings of missing networks and of what is in the ROS domain.
+    """Yield only what would make the start fail, and warnings of missing networks, of devices of serial lines, and of
+    what is in the ROS domain.
 
     Ports of listeners are not checked: systemd may hold them for the router.
     """
@@ -87,7 +88,8 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     yield from problems
     if program is not None:
         found = Names(program)
-        yield from (result._replace(grade=Grade.WARNING) for result in found.results() if result.grade != Grade.FINE)
+        later = chain(found.results(), lines(program, running=False))
+        yield from (result._replace(grade=Grade.WARNING) for result in later if result.grade != Grade.FINE)
         if not any(result.about == "ROS" for result in problems):
             yield from ros_peers(program)
         networks = chain(listeners(program), groups(program))

@@ -24,7 +24,6 @@ from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
-from router.net.serial import why_closed
 from router.net.udp import absence, why_no_way
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, SerialPlace, parse_address
@@ -250,22 +249,6 @@ def listeners(program: CompiledTable) -> Iterator[CheckResult]:
         elif listener.interface is not None:
             what = f"{about}: network interface {listener.interface} is down: the listener receives nothing"
             yield warning("listeners", what, f"run `ip link set {listener.interface} up`")
-
-
-def lines(program: CompiledTable) -> Iterator[CheckResult]:
-    """Check that the devices of serial lines are there, and that this user may open them."""
-    for line in program.table.lines:
-        device = line.address.value.host
-        about = f"listener '{line.name}'"
-        if not Path(device).exists():
-            why, remedy = why_closed(errno.ENOENT)
-            yield warning("listeners", f"{about} cannot open {device}: {why}", f"{remedy}; the router waits for it")
-        elif not os.access(device, os.R_OK | os.W_OK):
-            why, remedy = why_closed(errno.EACCES)
-            remedy = remedy.replace("DEVICE", device)
-            yield problem("listeners", f"{about} cannot open {device}: this user may not", remedy)
-        else:
-            yield fine("listeners", f"{about}: {device} is there")
 
 
 def ros_ports(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[CheckResult]:

@@ -30,7 +30,6 @@ from router.tools.doctor_checks import (
     clock,
     endpoints,
     fine,
-    lines,
     listeners,
     open_domain,
     page,
@@ -269,24 +268,6 @@ def test_what_a_listener_waits_for_is_a_warning(table: Path, look: type, old: st
         (Grade.WARNING, f"listener 'rover' cannot use {listener.bound_to}: {why}")
     ]
     assert all(listener.bound_to not in each.text for each in found if each.about == "ports")
-
-
-@pytest.mark.parametrize(
-    ("device", "grade", "text"),
-    [
-        ("/dev/tty", Grade.FINE, "listener 'uart': /dev/tty is there"),
-        ("/dev/nowhere", Grade.WARNING, "listener 'uart' cannot open /dev/nowhere: its device is not there"),
-    ],
-)
-def test_the_device_of_a_serial_line_is_looked_for(table: Path, device: str, grade: Grade, text: str) -> None:
-    """Neither a port nor a ping belongs to it."""
-    line = f"uart: {{serial: {device}, baud: 9600, framing: cobs}}"
-    table.write_text(table.read_text().replace("endpoints:\n", "endpoints:\n  lander: {listener: uart, kind: board}\n"))
-    program = rewritten(table, "listen: {", f"listen: {{{line}, ")
-    assert gist(lines(program)) == [(grade, True)]
-    assert [each.text for each in lines(program)] == [text]
-    others = [*listeners(program), *ports(program, running=False), *endpoints(program, {}), *receive_buffers(program)]
-    assert all("uart" not in each.text and "lander" not in each.text for each in others)
 
 
 def test_an_interface_that_is_down_is_a_warning(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
