@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -27,7 +28,12 @@ from tests.ports import free_port
 pytestmark = pytest.mark.slow
 
 MONITORED = (
-    ROVER.replace("acceptance/patient.yaml", "rover/routes/rover.yaml")
+    ROVER.replace("acceptance/patient.yaml", "rover/routes/rover.yaml").replace(
+        "endpoints:\n",
+        "  drill_line: {{serial: @drill, baud: 115200, framing: cobs}}\n"
+        "endpoints:\n"
+        "  drill: {{listener: drill_line, kind: board}}\n",
+    )
     + """
 gateways:
   dashboard:
@@ -82,6 +88,23 @@ class Traffic:
             self.place.waiting()
 
 
+class Plug:
+    """A pty as a serial device at `path`, while it is plugged in."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.plug_in()
+
+    def plug_in(self) -> None:
+        self._board, device = os.openpty()
+        self._path.symlink_to(os.ttyname(device))
+        os.close(device)
+
+    def pull(self) -> None:
+        self._path.unlink()
+        os.close(self._board)
+
+
 @dataclass
 class Monitored:
     """`address` is that of its metrics."""
@@ -89,6 +112,7 @@ class Monitored:
     address: str
     traffic: Traffic
     table: Path
+    drill: Plug
 
     def reload(self) -> bool:
         """Whether the router runs the table now."""
@@ -101,13 +125,15 @@ def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
     folder = tmp_path_factory.mktemp("monitored")
     gateway, foxglove = free_port(kind=socket.SOCK_STREAM), free_port(kind=socket.SOCK_STREAM)
     text = MONITORED.replace("@gateway", str(gateway)).replace("@foxglove", str(foxglove))
+    text, drill = text.replace("@drill", str(folder / "drill")), Plug(folder / "drill")
     with (
         site(folder) as place,
         RouterProcess(folder, table := place.table(text)),
         connect(f"ws://127.0.0.1:{gateway}", close_timeout=0.1),  # it reads nothing, so that it is behind
         Traffic(place) as traffic,
     ):
-        yield Monitored(f"127.0.0.1:{place.metrics}", traffic, table)
+        yield Monitored(f"127.0.0.1:{place.metrics}", traffic, table, drill)
+    drill.pull()
 
 
 @pytest.fixture(scope="module")
@@ -197,6 +223,19 @@ def test_a_deadman_that_takes_over_is_an_alert_until_commands_come_again(
     wait_until(lambda: halted() == {"manual_drive"}, "the alert")
     monitored.traffic.paused.clear()
     wait_until(lambda: halted() == set(), "the end of the alert")
+
+
+def test_a_serial_line_that_is_unplugged_is_an_alert_until_it_is_plugged_in(
+    monitored: Monitored, prometheus: PrometheusServer
+) -> None:
+    def closed() -> list[str]:
+        return [labels["listener"] for labels in prometheus.firing("LinkClosed")]
+
+    assert closed() == []
+    monitored.drill.pull()
+    wait_until(lambda: closed() == ["drill_line"], "the alert")
+    monitored.drill.plug_in()
+    wait_until(lambda: closed() == [], "the end of the alert")
 
 
 def test_a_refused_table_is_an_alert_until_one_is_taken(monitored: Monitored, prometheus: PrometheusServer) -> None:
