@@ -17,6 +17,7 @@ from router.table.model.settings import EnvelopeSettings
 from router.types.envelopes import chosen_envelope
 from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
+from router.types.model import MessageType
 from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
 from router.types.table_envelopes import Envelopes
 from router.types.wire import read_varint
@@ -24,18 +25,23 @@ from router.types.wire import read_varint
 Peer = tuple[str, int]
 """The IP address and port of a sender."""
 
+_NO_FIELDS = MessageType("")
+
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
     """A payload and its case. `zeros` is the number of trailing zeros restored, or removed if negative.
 
-    `superseded` has the cases of other payloads before it.
+    `superseded` has the cases of other payloads before it. `beside` is the envelope without the payload, None if that
+    has no other fields, and `beside_type` its type.
     """
 
     case: PayloadCase
     message: Message
     zeros: int
     superseded: Sequence[str] = ()
+    beside: Message | None = None
+    beside_type: MessageType = _NO_FIELDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +93,10 @@ class Wire:
         except ProtobufError as error:
             raise DecodeError(f"malformed: {_unparsed(members[0])}") from error
         superseded = payloads(envelope, whole, repairs=False)[:-1] if len(found) == 1 else ()
-        return [Decoded(case, message, len(whole) - len(datagram), superseded) for case, message in found]
+        kind = envelope.beside
+        beside = envelope.beside_of(outer) if kind.fields else None
+        zeros = len(whole) - len(datagram)
+        return [Decoded(case, message, zeros, superseded, beside, kind) for case, message in found]
 
 
 def wire_of_table(table: RouteTable) -> Wire:

@@ -20,15 +20,15 @@ class NativeCondition:
         self._layout = routines.layout()
         self._holds = library.condition_holds
 
-    def holds(self, payload: bytes, source: str, received_at: int) -> bool | None:
+    def holds(self, payload: bytes, beside: bytes, source: str, received_at: int) -> bool | None:
         """Return whether the condition holds for a payload from `source`; None if it has no value.
 
-        `received_at` is wall-clock time in ns. Raises MemoryError.
+        `beside` is the envelope without the payload, `received_at` wall-clock time in ns. Raises MemoryError.
         """
-        named = Arrays()
-        sender, holds = native_values([source.encode()], named), ctypes.c_bool()
-        routine, size = ctypes.byref(self._routine), len(payload)
-        outcome = self._holds(self._layout, routine, sender, received_at, payload, size, ctypes.byref(holds))
+        holds = ctypes.c_bool()
+        given = map(ctypes.byref, native_values([source.encode(), payload, beside], named := Arrays()))
+        outcome = self._holds(self._layout, ctypes.byref(self._routine), received_at, *given, ctypes.byref(holds))
+        del named  # until here it has kept the values
         if outcome == DROP_REASONS:
             raise MemoryError("a condition cannot be evaluated")
         return holds.value if outcome == EVALUATED else None

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.udp import Sent, send
 
     wire, table = load_wire(args, args.to)
-    exact = _envelope(wire, args.case, args.fields)
+    exact = envelope_of(wire, args.case, args.fields)
     data = framed(exact, args.trim, args.pad)
     count = args.count if args.count is not None else None if args.rate else 1
     if table is not None and (line := links.line_of(args.to, table)) is not None:
@@ -97,7 +97,7 @@ def _send_frames(args: argparse.Namespace, line: Listener, table: RouteTable, da
     return 0
 
 
-def _envelope(wire: Wire, name: str, words: Sequence[str]) -> bytes:
+def envelope_of(wire: Wire, name: str, words: Sequence[str]) -> bytes:
     """Return the envelope that the words describe: `envelope.x=1` is beside the payload, unless that has the field."""
     from router.compiler.expressions.tree import ENVELOPE
     from router.values.reading import assigned, payload

@@ -152,7 +152,7 @@ def _print(args: argparse.Namespace, recording: Recording, wire: Wire, entries: 
     cases = [wire.case(name) for name in args.cases] or list(wire.envelopes.cases.values())
     if args.where and not cases:
         raise UsageError(f"{recording.path} has no payloads, so --where has none to look at")
-    condition = Condition(args.where, cases) if args.where else None
+    condition = Condition(args.where, wire.envelopes, cases) if args.where else None
     chosen, span = Filter(args.cases, condition), _window(args, first)
     last, count = first.at, 0
 

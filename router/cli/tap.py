@@ -18,8 +18,8 @@ from router.cli.tool_options import (
     until_interrupted,
 )
 
-_DESCRIPTION = """Print what a running router receives: the fields that are not at their default, and the reason for
-each rejected datagram. Without --from and --only, also print the commands that it sends, and what its deadmen do. The
+_DESCRIPTION = """Print what a running router receives: the fields that are not at their default, those beside the
+payload as 'envelope.seq=5', and the reason for each rejected datagram. Without --from and --only, also print the commands that it sends, and what its deadmen do. The
 router is reached at the table's 'http.address', on this computer. It never waits for this terminal; lines that the
 terminal missed are counted. To listen at a port or a ROS topic without a router, use 'router listen'."""
 _EXAMPLES = (
@@ -44,7 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     about = "only datagrams that a route took, or only those that none took"
     parser.add_argument("--only", choices=("accepted", "rejected"), help=about)
-    about = "only payloads for which this expression is true: 'satellites < 4'"
+    about = "only payloads for which this expression is true: 'satellites < 4', 'envelope.seq > 9'"
     parser.add_argument("--where", metavar="EXPR", help=about)
     add_count(parser)
     add_for(parser)
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     wire, _ = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
     cases = cases or list(wire.envelopes.cases.values())
-    condition = Condition(args.where, cases) if args.where else None
+    condition = Condition(args.where, wire.envelopes, cases) if args.where else None
     taken = RunningTap(wire, Filter(args.cases, condition))
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router has priority over observers on its computer.

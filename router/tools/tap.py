@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Any
 
-from google.protobuf.message import Message
-
 from router.carrier.conditions import NativeCondition
 from router.clock import wall_ns
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
-from router.compiler.expressions.tree import Node
+from router.compiler.expressions.tree import ENVELOPE, Node
 from router.compiler.lowering import lower_condition
 from router.compiler.lowering.names import TooLargeError
 from router.datagrams import Decoded, Wire
@@ -29,7 +27,8 @@ from router.table.nodes import TextSpan
 from router.table.units import LARGEST_DATAGRAM
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase
-from router.values.printing import clock_text, compact, one_line, protobuf_json, ros_json, ros_tree, words
+from router.types.table_envelopes import Envelopes
+from router.values.printing import clock_text, one_line, protobuf_json, protobuf_tree, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.recording.reader import Recorded
@@ -37,20 +36,21 @@ if TYPE_CHECKING:
 
 
 class Condition:
-    """One expression for several payload cases; it may use fields that not all of them have.
+    """One expression for several payload cases; it may use fields that not all of them have, and `envelope`.
 
     The library evaluates it like `when`. `failure` names the first case with a payload for which it has no value, for
     example because of a division by zero: there it counts as false.
     """
 
-    def __init__(self, text: str, cases: Sequence[PayloadCase]) -> None:
+    def __init__(self, text: str, envelopes: Envelopes, cases: Sequence[PayloadCase]) -> None:
         """Parse the expression. Raises UsageError if it fits none of the cases, StartError without a library."""
         self.failure = ""
         self._conditions: dict[str, NativeCondition] = {}
         findings: dict[str, Diagnostic] = {}
         for case in cases:
+            envelope = envelopes.of(case.name)
             try:
-                lowered = lower_condition(_checked(text, case.type), case)
+                lowered = lower_condition(_checked(text, case.type, envelope), case, envelope)
                 self._conditions[case.name] = NativeCondition(library(), lowered)
             except (ExpressionError, TooLargeError) as error:
                 findings[case.name] = error.diagnostic
@@ -64,19 +64,22 @@ class Condition:
         """The payload cases that have all fields of the expression."""
         return frozenset(self._conditions)
 
-    def holds(self, case: str, payload: Message, source: str, received_at: int) -> bool:
+    def holds(self, decoded: Decoded, source: str, received_at: int) -> bool:
+        case = decoded.case.name
         if (condition := self._conditions.get(case)) is None:
             return False
-        holds = condition.holds(payload.SerializePartialToString(), source, received_at)
+        beside = decoded.beside.SerializePartialToString() if decoded.beside is not None else b""
+        holds = condition.holds(decoded.message.SerializePartialToString(), beside, source, received_at)
         if holds is None:
             self.failure = self.failure or f"{case}: for example, because of a division by zero"
         return bool(holds)
 
 
-def _checked(text: str, message: MessageType) -> Node:
+def _checked(text: str, message: MessageType, envelope: Envelope) -> Node:
     """Parse a condition on a message. Raises ExpressionError if it is not a valid one."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
-    node = check(Expression(text, TextSpan(span, ((0, span),))), Scope(message, tuple(_enums(message)), ()))
+    scope = Scope(message, tuple(_enums(message, envelope.beside)), (), envelope=envelope)
+    node = check(Expression(text, TextSpan(span, ((0, span),))), scope)
     if not isinstance(node.kind, BoolKind):
         raise ExpressionError(
             span, Code.TYPE_MISMATCH, f"it is {node.kind}, not a bool", "compare something, as in speed > 0"
@@ -84,9 +87,9 @@ def _checked(text: str, message: MessageType) -> Node:
     return node
 
 
-def _enums(message: MessageType) -> Iterator[Enum]:
-    """Return the enum types of all fields of a message and of the messages in it, each once."""
-    waiting: list[Type] = [message]
+def _enums(*messages: MessageType) -> Iterator[Enum]:
+    """Return the enum types of all fields of the messages and of the messages in them, each once."""
+    waiting: list[Type] = [*messages]
     types: dict[str, Type] = {}
     while waiting:
         current = waiting.pop()
@@ -122,7 +125,7 @@ class TappedDatagram:
         start = f"{clock_text(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
-        line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
+        line = f"{start} {self.decoded.case.name} {_one_line(self.decoded)}"
         if self.decoded.zeros:
             line += f" ({self._repair(self.decoded.zeros)})"
         if self.decoded.superseded:
@@ -144,8 +147,7 @@ class TappedDatagram:
         if self.decoded is None:
             document["problem"] = self.problem
         else:
-            document["case"] = self.decoded.case.name
-            document["fields"] = protobuf_json(self.decoded.message)
+            document |= _json(self.decoded)
             document["zeros_restored"] = self.decoded.zeros
             if self.decoded.superseded:
                 document["superseded"] = self.decoded.superseded
@@ -192,7 +194,7 @@ class ShownAction:
     def _payload(self) -> str:
         if self.decoded is None:
             return f"undecodable: {self.action.data.hex()}"
-        return f"{self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}".rstrip()
+        return f"{self.decoded.case.name} {_one_line(self.decoded)}"
 
     def json(self, with_hex: bool) -> str:
         """Return one JSON object."""
@@ -202,9 +204,23 @@ class ShownAction:
         texts = {"route": it.route, "endpoint": it.target, "topic": it.topic, "reason": it.reason, "detail": it.detail}
         document |= {key: text for key, text in texts.items() if text}
         if self.decoded is not None:
-            document["case"] = self.decoded.case.name
-            document["fields"] = protobuf_json(self.decoded.message)
+            document |= _json(self.decoded)
         return json.dumps(document)
+
+
+def _one_line(decoded: Decoded) -> str:
+    """Return the fields that are set as `router send` takes them: `speed=1 envelope.seq=5`."""
+    listed = [*words(protobuf_tree(decoded.message, decoded.case.type))]
+    if decoded.beside is not None and (beside := protobuf_tree(decoded.beside, decoded.beside_type)):
+        listed += words(beside, ENVELOPE)
+    return one_line(listed)
+
+
+def _json(decoded: Decoded) -> dict[str, object]:
+    document: dict[str, object] = {"case": decoded.case.name, "fields": protobuf_json(decoded.message)}
+    if decoded.beside is not None:
+        document[ENVELOPE] = protobuf_json(decoded.beside)
+    return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +272,7 @@ class Filter:
         if (decoded := shown.decoded) is None or (self._cases and decoded.case.name not in self._cases):
             return False
         sender = shown.peer if isinstance(shown, TappedDatagram) else ""
-        return self._condition is None or self._condition.holds(decoded.case.name, decoded.message, sender, at)
+        return self._condition is None or self._condition.holds(decoded, sender, at)
 
 
 class RunningTap:

@@ -208,6 +208,17 @@ class Envelope:
         cases = (self.cases[name] for name in self.members_of(frame) if name in self.cases)
         return [(case, self.choice.payload(frame, case)) for case in cases]
 
+    def beside_of(self, frame: Message) -> Message:
+        """Return a copy of a parsed frame with only its fields beside the payload."""
+        beside = self.message_class()
+        if self.beside.fields:
+            beside.CopyFrom(frame)
+            beside.DiscardUnknownFields()
+            for field, _ in frame.ListFields():
+                if self.beside.field(field.name) is None:
+                    beside.ClearField(field.name)
+        return beside
+
     def around(self, case: PayloadCase, payload: Message, beside: Message | None = None) -> Message:
         """Return an envelope with this payload, even an empty one, and with the other fields of `beside`."""
         envelope = self.message_class()

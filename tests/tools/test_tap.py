@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from router.cli.send import envelope_of
 from router.compiler import check_table
-from router.datagrams import Wire
+from router.datagrams import Decoded, Wire
 from router.errors import UsageError
 from router.observe.tap import Lost
 from router.recording.mirror import BRAKED, SENT, TRIPPED, Action, MirroredDatagram
 from router.table.addresses import Address
-from router.tools.tap import Condition, Filter, RunningTap, listen, tapped_datagram
+from router.tools.tap import Condition, Filter, RunningTap, listen, shown, tapped_datagram
 from router.tools.udp import open_udp
 from router.values.reading import payload
 from tests.observe.fake_running import sim_program
@@ -40,13 +41,63 @@ def test_repairs_are_told(wire: Wire) -> None:
 
 
 def test_each_message_of_a_datagram_has_a_line() -> None:
-    program = check_table(TABLES / "vision.yaml", {}).program
-    assert program is not None
-    told = tapped_datagram(0, "camera", b"\x3a\x02\x08\x09\x12\x02\x08\x05", Wire(program.envelopes))
+    told = tapped_datagram(0, "camera", b"\x3a\x02\x08\x09\x12\x02\x08\x05", wire_of("vision.yaml"))
     assert [each.line(with_hex=False).split(" ", 1)[1] for each in told] == [
         "camera detection frame=5",
         "camera geometry length=9",
     ]
+
+
+def wire_of(table: str) -> Wire:
+    program = check_table(TABLES / table, {}).program
+    assert program is not None
+    return Wire(program.envelopes)
+
+
+@pytest.mark.parametrize(
+    ("table", "case", "inside", "around", "beside"),
+    [
+        (
+            "beside.yaml",
+            "speed",
+            "value=1.5",
+            "envelope.header.seq=2 envelope.robot=3 envelope.mode=AUTONOMOUS envelope.volts=0.5",
+            {"header": {"seq": 2}, "robot": 3, "mode": "AUTONOMOUS", "volts": 0.5},
+        ),
+        ("beside.yaml", "speed", "value=1.5", "", {}),
+        ("named.yaml", "burt.Status", "mode=DRIVING", "envelope.sequence=7", {"sequence": 7}),
+        ("vision.yaml", "detection", "frame=5", "envelope.camera=2", {"camera": 2}),
+        ("framed.yaml", "referee", "sequence=5", "", None),
+    ],
+)
+def test_fields_beside_the_payload_are_shown_as_they_are_sent(
+    table: str, case: str, inside: str, around: str, beside: object
+) -> None:
+    wire = wire_of(table)
+    data = envelope_of(wire, case, [*inside.split(), *around.split()])
+    [told] = tapped_datagram(0, "board", data, wire)
+    assert told.line(with_hex=False).split(" ", 1)[1] == " ".join(filter(None, ("board", case, inside, around)))
+    assert json.loads(told.json(with_hex=False)).get("envelope") == beside
+    [sent] = shown(Action(2, SENT, "drive", "board", data=data), wire)
+    assert sent.line(with_hex=False).endswith(" ".join(filter(None, (case, inside, around))))
+    assert json.loads(sent.json(with_hex=False)).get("envelope") == beside
+
+
+@pytest.mark.parametrize(
+    ("table", "case", "where", "holds"),
+    [
+        ("beside.yaml", "speed", "envelope.robot == 3 and value > 1", True),
+        ("beside.yaml", "speed", "envelope.mode == Mode.MANUAL", False),
+        ("named.yaml", "burt.Status", "envelope.sequence > 6", True),
+        ("vision.yaml", "detection", "envelope.camera == 3", False),
+    ],
+)
+def test_a_condition_reads_fields_beside_the_payload(table: str, case: str, where: str, holds: bool) -> None:
+    wire = wire_of(table)
+    words = {"speed": "value=1.5 envelope.robot=3 envelope.mode=AUTONOMOUS", "detection": "envelope.camera=2"}
+    data = envelope_of(wire, case, words.get(case, "envelope.sequence=7").split())
+    [told] = tapped_datagram(0, "board", data, wire)
+    assert Filter((), Condition(where, wire.envelopes, [wire.case(case)])).takes(told, 0) is holds
 
 
 def test_payloads_that_the_last_one_replaces_are_told(wire: Wire) -> None:
@@ -120,12 +171,13 @@ def test_datagrams_are_heard_in_order(wire: Wire) -> None:
     assert first.peer.startswith("port ")
 
 
-ENVELOPE = sim_program().envelopes.first
-CASES = ENVELOPE.cases
+ENVELOPES = sim_program().envelopes
+CASES = ENVELOPES.cases
 
 
 def holds(text: str, case: str, source: str = "sensor_board", **fields: object) -> bool:
-    return Condition(text, [CASES[case]]).holds(case, CASES[case].message_class(**fields), source, 0)
+    decoded = Decoded(CASES[case], CASES[case].message_class(**fields), 0)
+    return Condition(text, ENVELOPES, [CASES[case]]).holds(decoded, source, 0)
 
 
 @pytest.mark.parametrize(
@@ -149,9 +201,9 @@ def test_a_condition_is_an_expression_over_the_payload(text: str, is_true: bool)
 
 
 def test_cases_without_the_field_are_left_out() -> None:
-    condition = Condition("satellites < 4", list(CASES.values()))
+    condition = Condition("satellites < 4", ENVELOPES, list(CASES.values()))
     assert condition.cases == {"gps_info"}
-    assert not condition.holds("imu_info", CASES["imu_info"].message_class(), "sensor_board", 0)
+    assert not condition.holds(Decoded(CASES["imu_info"], CASES["imu_info"].message_class(), 0), "sensor_board", 0)
 
 
 @pytest.mark.parametrize(
@@ -165,11 +217,11 @@ def test_cases_without_the_field_are_left_out() -> None:
 )
 def test_what_is_no_condition_is_refused(text: str, complaint: str) -> None:
     with pytest.raises(UsageError) as refused:
-        Condition(text, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
+        Condition(text, ENVELOPES, list(CASES.values()) if "<" in text else [CASES["gps_info"]])
     assert str(refused.value).startswith(complaint)
 
 
 def test_where_it_cannot_be_computed_it_does_not_hold_and_is_remembered() -> None:
-    condition = Condition("altitude / speed > 1", [CASES["gps_info"]])
-    assert not condition.holds("gps_info", CASES["gps_info"].message_class(), "sensor_board", 0)
+    condition = Condition("altitude / speed > 1", ENVELOPES, [CASES["gps_info"]])
+    assert not condition.holds(Decoded(CASES["gps_info"], CASES["gps_info"].message_class(), 0), "sensor_board", 0)
     assert condition.failure.startswith("gps_info: ")

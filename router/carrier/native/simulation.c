@@ -222,22 +222,23 @@ const void *simulation_records(struct simulation *simulation, size_t *size) {
 /* ---- stand-alone conditions ---- */
 
 static int evaluate_on_payload(struct machine *machine, const struct layout *layout, const struct routine *condition,
-                               const struct value *source, int64_t received_at, const void *payload, size_t size,
-                               bool *holds) {
+                               int64_t received_at, const struct value *source, const struct value *payload,
+                               const struct value *beside, bool *holds) {
     uint32_t at;
     if (!machine_open(machine)) return DROP_REASONS;
     machine_begin(machine, layout);
     machine->slots[SLOT_RECEIVED_AT].integer = received_at;
     machine->slots[SLOT_SOURCE] = *source;
-    if (!machine_read(machine, payload, size)) return DROP_MAPPING_ERROR;
+    bool is_read = machine_read(machine, payload->bytes, payload->size);
+    if (!is_read || !machine_read_envelope(machine, beside->bytes, beside->size)) return DROP_MAPPING_ERROR;
     return evaluate_condition(machine, condition, holds, &at);
 }
 
-int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
-                    int64_t received_at, const void *payload, size_t size, bool *holds) {
+int condition_holds(const struct layout *layout, const struct routine *condition, int64_t received_at,
+                    const struct value *source, const struct value *payload, const struct value *beside, bool *holds) {
     struct machine *machine = calloc(1, sizeof *machine);
     if (!machine) return DROP_REASONS;
-    int outcome = evaluate_on_payload(machine, layout, condition, source, received_at, payload, size, holds);
+    int outcome = evaluate_on_payload(machine, layout, condition, received_at, source, payload, beside, holds);
     machine_close(machine);
     free(machine);
     return outcome;

@@ -66,9 +66,10 @@ void simulation_end(struct simulation *simulation);
  * memory runs out. */
 const void *simulation_records(struct simulation *simulation, size_t *size);
 
-/* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender. Return EVALUATED, an
- * enum drop_reason if it has no value for this payload or the payload is malformed, or DROP_REASONS if memory runs out. */
-int condition_holds(const struct layout *layout, const struct routine *condition, const struct value *source,
-                    int64_t received_at, const void *payload, size_t size, bool *holds);
+/* Evaluate a condition on a payload, like `when` of a route. `source` is the name of the sender, `beside` the envelope, which
+ * may lack the payload. Return EVALUATED, an enum drop_reason if it has no value for this payload or the payload is
+ * malformed, or DROP_REASONS if memory runs out. */
+int condition_holds(const struct layout *layout, const struct routine *condition, int64_t received_at,
+                    const struct value *source, const struct value *payload, const struct value *beside, bool *holds);
 
 #endif
