@@ -118,6 +118,7 @@ class Code(enum.Enum):
         "empty-field",
         "A field of the envelope, beside the payload, that nothing fills where the router makes envelopes for boards.",
     )
+    UNUSED_SET = ("unused-set", "A `set` of an endpoint for which the router makes no messages.")
     UNKNOWN_STATE = ("unknown-state", "A condition reads a state that is not in `state`.")
     NEVER_SET = ("never-set", "A state that no message can set, because no route takes its messages.")
     NO_TARGET = ("no-target", "A route without destinations or topics.")
@@ -166,6 +167,7 @@ _WARNINGS = frozenset(
         Code.DOUBTFUL_DEADMAN,
         Code.NO_TTL,
         Code.EMPTY_FIELD,
+        Code.UNUSED_SET,
         Code.CUT_EXPRESSION,
     }
 )

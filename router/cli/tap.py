@@ -19,9 +19,10 @@ from router.cli.tool_options import (
 )
 
 _DESCRIPTION = """Print what a running router receives: the fields that are not at their default, those beside the
-payload as 'envelope.seq=5', and the reason for each rejected datagram. Without --from and --only, also print the commands that it sends, and what its deadmen do. The
-router is reached at the table's 'http.address', on this computer. It never waits for this terminal; lines that the
-terminal missed are counted. To listen at a port or a ROS topic without a router, use 'router listen'."""
+payload as 'envelope.seq=5', and the reason for each rejected datagram. Without --from and --only, also print the
+commands that it sends, and what its deadmen do. The router is reached at the table's 'http.address', on this
+computer. It never waits for this terminal; lines that the terminal missed are counted. To listen at a port or a ROS
+topic without a router, use 'router listen'."""
 _EXAMPLES = (
     "router tap imu_info gps_info -t routes/sim.yaml",
     "router tap --from arm_board --for 10s",

@@ -89,8 +89,11 @@ class _Set:
         lookup, envelope = self.lookup, self._around
         constants, changing, sources = [], dict[Path, Changing](), dict[str, Row]()
         if not envelope.beside.fields:
-            message = f"{envelope.name} has no fields beside the payload"
-            raise FindingError(self.fields.span, Code.UNKNOWN_FIELD, message, "remove 'set'")
+            message, hint = f"{envelope.name} has no fields beside the payload", "remove 'set'"
+            if root := envelope.choice.root:
+                message = f"{envelope.name} is the payload '{root}' itself, so no fields are beside it"
+                hint = "fill its fields in `fields` of a route from ROS and in a deadman's `send`"
+            raise FindingError(self.fields.span, Code.UNKNOWN_FIELD, message, hint)
         for entry in self.fields.entries:
             if entry.path[0] in envelope.numbers:
                 message = f"'{entry.path[0]}' is a payload, not a field beside it"

@@ -130,6 +130,7 @@ def check_table(
         *network_findings(table),
         *_board_findings(table, boards),
         *_envelope_findings(lookup, routes),
+        *_unused_sets(lookup, routes),
         *lookup.findings,
         *condition_findings(lookup, routes),
         *clash_findings(table),
@@ -225,6 +226,21 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
             more = ", ..." * (len(names) > 1)
             hint = f"write `set: {{{names[0]}: VALUE{more}}}` in the endpoint, or `because: why` in 'envelope'"
             yield Diagnostic(endpoint.span, Code.EMPTY_FIELD, what, hint)
+
+
+def _unused_sets(lookup: Lookup, routes: Sequence[CheckedRoute]) -> Iterator[Diagnostic]:
+    """Yield findings for `set` of endpoints for which the router makes no envelopes."""
+    made = {name for checked in routes for name in _made_for(checked)}
+    sound = {checked.route.name for checked in routes if checked.deadman is not None}
+    for route in lookup.table.routes:
+        if route.is_outbound or (route.deadman is not None and route.name not in sound):  # it may have findings
+            made |= {destination.endpoint.value for destination in route.destinations}
+    for endpoint in lookup.table.endpoints.values():
+        name, written = endpoint.name, endpoint.beside
+        if written is not None and name in lookup.beside and name not in made and not lookup.table.broken:
+            what = f"'set' of '{name}' fills nothing: no route from ROS and no deadman sends to it"
+            hint = "remove 'set'; what is forwarded keeps its own fields"
+            yield Diagnostic(written.span, Code.UNUSED_SET, what, hint)
 
 
 def _made_for(checked: CheckedRoute) -> Iterator[str]:

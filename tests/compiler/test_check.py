@@ -17,6 +17,7 @@ from router.compiler import check, check_table
 from router.errors import Code
 from router.image.writer import write_image
 from tests.bad_tables.corpus import HERE
+from tests.recording.test_choices import TABLES
 from tests.tables import ROUTES
 
 
@@ -103,6 +104,39 @@ def test_set_fills_what_the_envelope_requires_for_its_endpoint_only(tmp_path: Pa
         assert [(each.code, each.message.rpartition(" ")[2]) for each in found] == [
             (Code.MISSING_KEY, name) for name in lacking
         ]
+
+
+@pytest.mark.parametrize(
+    ("drive", "unused"),
+    [
+        ("{source: base, destinations: board, deadman: {none: it is a test}}", ["board", "base"]),
+        ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {drive: {}}}}", ["base"]),
+        ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {driv: {}}}}", ["base"]),
+        (f"{{{SPEED}, destinations: [board, base], deadman: {{none: it is a test}}}}", []),
+        (f"{{source: board, destinations: base, {TO_BASE}}}", ["board"]),
+    ],
+)
+def test_set_is_unused_where_the_router_only_forwards(tmp_path: Path, drive: str, unused: list[str]) -> None:
+    table = tmp_path / "table.yaml"
+    text = BESIDE.format(protos=HERE / "protos" / "must", because="", drive=drive)
+    for end in ("kind: board", "kind: basestation"):
+        text = text.replace(end, f"{end}, set: {{sequence: 7}}")
+    table.write_text(text)
+    found = [each.message for each in check_table(table, {}).diagnostics if each.code is Code.UNUSED_SET]
+    message = "'set' of '{}' fills nothing: no route from ROS and no deadman sends to it"
+    assert found == [message.format(name) for name in unused]
+
+
+def test_set_is_refused_where_a_datagram_is_the_payload_itself(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    framed = TABLES / "framed"
+    text = (TABLES / "framed.yaml").read_text().replace("protos: framed", f"protos: {framed}")
+    table.write_text(text.replace("kind: board}", "kind: board, set: {sequence: sequence}}"))
+    [found] = [each for each in check_table(table, {}).diagnostics if each.code is not Code.NOT_LOCKED]
+    assert (found.code, found.message) == (
+        Code.UNKNOWN_FIELD,
+        "Referee is the payload 'referee' itself, so no fields are beside it",
+    )
 
 
 def plain(value: Any) -> Any:
