@@ -61,10 +61,22 @@ class Wire:
 
         Raises UsageError if the payload lacks a required field.
         """
-        if not payload.IsInitialized():
-            fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
-            raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
-        return self.envelopes.of(case.name).around(case, payload, beside).SerializePartialToString()
+        return self.encode_all([(case, payload)], beside)
+
+    def encode_all(self, payloads: Sequence[tuple[PayloadCase, Message]], beside: Message | None = None) -> bytes:
+        """Like `encode`, with one payload or several. Raises UsageError also if the envelope cannot hold them."""
+        (first, inside), *others = payloads
+        envelope = self.envelopes.of(first.name)
+        if others and not all(case.wrapping.is_shared and case.name in envelope.cases for case, _ in payloads):
+            raise UsageError(f"{envelope.name} cannot hold {' and '.join(case.name for case, _ in payloads)} at once")
+        for case, payload in payloads:
+            if not payload.IsInitialized():
+                fields = " and ".join(payload.FindInitializationErrors())  # type: ignore[attr-defined]  # all have it
+                raise UsageError(f"{case.type.name} requires {fields}", f"give {fields} a value")
+        frame = envelope.around(first, inside, beside)
+        for case, payload in others:
+            envelope.choice.put(frame, case, payload)
+        return frame.SerializePartialToString()
 
     def decode(self, datagram: bytes, envelope: Envelope | None = None) -> Decoded:
         """Parse a datagram as a listener with `framing: zero_trimmed` does; `envelope` is the only one by default.

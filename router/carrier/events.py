@@ -143,8 +143,8 @@ class EventReader:
         if kind == EventKind.STATE:
             changed = StateEvent.from_buffer(record)
             source = self._name(changed.source) if changed.source != NO_NAME else None
-            before, after = (content_of(each, changed.is_text) for each in (changed.before, changed.after))
-            return StateChange(self._name(changed.state), before, after, source)
+            was, became = (content_of(each, changed.is_text) for each in (changed.before, changed.after))
+            return StateChange(self._name(changed.state), was, became, source)
         if kind == EventKind.LINK:
             link = LinkEvent.from_buffer(record)
             return LinkChange(self._name(link.listener), link.error)

@@ -25,6 +25,7 @@ _EXAMPLES = (
     "router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000",
     "router send imu_info -t routes/sim.yaml --to rover --from sensor_board",
     "router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation",
+    "router send detection frame=5 geometry length=9 envelope.camera=2 -t routes/vision.yaml --to vision",
     "router send manual_drive --to rover --rate 20Hz --count 1000",
 )
 
@@ -39,7 +40,8 @@ line, send it as the board: at a pty, when the router has opened it; to the boar
             "fields",
             nargs="*",
             metavar="FIELD=VALUE",
-            help="x=1, bbox.x=3, points[1]=2, counts[left]=4, state=NAME; envelope.seq=5 is beside the payload",
+            help="x=1, bbox.x=3, points[1]=2, counts[left]=4, state=NAME; envelope.seq=5 is beside the payload; a word "
+            "without = is one more payload case of the same datagram",
         ),
         fields,
     )
@@ -63,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.udp import Sent, send
 
     wire, table = load_wire(args, args.to)
-    exact = envelope_of(wire, args.case, args.fields)
+    exact = envelope_of(wire, [args.case, *args.fields])
     data = framed(exact, args.trim, args.pad)
     count = args.count if args.count is not None else None if args.rate else 1
     if table is not None and (line := links.line_of(args.to, table)) is not None:
@@ -76,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         if (endpoint := udp.endpoint_of(args.to, table)) is not None:
             udp.aim(sender, endpoint)
         send(sender, to, data, count, args.rate, sent)
-    print(_summary(args.case, data, str(to), sent))
+    print(_summary(_cases(args), data, str(to), sent))
     return _advise(args, table, to, sent)
 
 
@@ -93,22 +95,39 @@ def _send_frames(args: argparse.Namespace, line: Listener, table: RouteTable, da
         if args.to != board:
             say(f"waiting for the router to open {end.device}; press Ctrl-C to stop")
         links.send(end, data, count, args.rate, sent)
-    print(_summary(args.case, data, args.to, sent))
+    print(_summary(_cases(args), data, args.to, sent))
     return 0
 
 
-def envelope_of(wire: Wire, name: str, words: Sequence[str]) -> bytes:
-    """Return the envelope that the words describe: `envelope.x=1` is beside the payload, unless that has the field."""
+def _cases(args: argparse.Namespace) -> str:
+    return " and ".join([args.case, *(word for word in args.fields if "=" not in word)])
+
+
+def envelope_of(wire: Wire, words: Sequence[str]) -> bytes:
+    """Return the envelope that the words describe: payload cases, each followed by its fields.
+
+    `envelope.x=1` is beside the payload, unless that has the field. Raises UsageError.
+    """
     from router.compiler.expressions.tree import ENVELOPE
     from router.values.reading import assigned, payload
 
-    case = wire.case(name)
-    envelope = wire.envelopes.of(name)
     prefix = f"{ENVELOPE}."
-    is_beside = [word.startswith(prefix) and case.type.field(ENVELOPE) is None for word in words]
-    inside = [word for word, beside in zip(words, is_beside, strict=True) if not beside]
-    around = [word.removeprefix(prefix) for word, beside in zip(words, is_beside, strict=True) if beside]
-    return wire.encode(case, payload(case, inside), assigned(envelope.message_class(), envelope.beside, around))
+    inside: dict[str, list[str]] = {}
+    around: list[str] = []
+    for word in words:
+        if not inside or "=" not in word:
+            if word in inside:
+                raise UsageError(f"the payload case '{word}' is named twice")
+            if inside and word not in wire.envelopes.cases:
+                raise UsageError(f"'{word}' is neither a field with a value nor a payload case", f"write {word}=value")
+            case, inside[word] = wire.case(word), []
+        elif word.startswith(prefix) and case.type.field(ENVELOPE) is None:
+            around.append(word.removeprefix(prefix))
+        else:
+            inside[case.name].append(word)
+    envelope = wire.envelopes.of(next(iter(inside)))
+    payloads = [(wire.case(name), payload(wire.case(name), fields)) for name, fields in inside.items()]
+    return wire.encode_all(payloads, assigned(envelope.message_class(), envelope.beside, around))
 
 
 def _summary(case: str, data: bytes, to: str, sent: Sent) -> str:

@@ -105,11 +105,11 @@ def _datagram(given: Given, wire: Wire, now: int) -> bytes:
     """
     data = given.data or b""
     try:
-        if given.case is not None and given.fields is not None:
-            payload = protobuf_message(given.case.message_class, given.fields, now)
-            around = wire.envelopes.of(given.case.name).message_class
+        if given.payloads:
+            payloads = [(case, protobuf_message(case.message_class, fields, now)) for case, fields in given.payloads]
+            around = wire.envelopes.of(given.payloads[0][0].name).message_class
             beside = protobuf_message(around, given.beside, now) if given.beside is not None else None
-            data = wire.encode(given.case, payload, beside)
+            data = wire.encode_all(payloads, beside)
         return framed(data, given.trim, given.pad)
     except UsageError as error:
         raise InvalidValueError(given.span, Code.BAD_VALUE, str(error)) from error

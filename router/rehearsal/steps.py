@@ -6,7 +6,7 @@ Every name must be in the table under test; otherwise InvalidValueError is raise
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -36,16 +36,16 @@ Counts = Mapping[str, int]
 class Given:
     """A message that arrives `times` times, `every` ns, each sent `age` ns before.
 
-    With a `topic` it is a ROS message, else a datagram from `peer` at `listener`. Its content is `fields` (for a
-    datagram, those of the payload `case`, and `beside` of the envelope) or the bytes `data`. `pad` in bytes, 0 for
-    none.
+    With a `topic` it is a ROS message, else a datagram from `peer` at `listener`. The content of a message is `fields`,
+    that of a datagram `payloads`, by payload case, and `beside` of the envelope; or either has the bytes `data`. `pad`
+    in bytes, 0 for none.
     """
 
     span: SourceSpan
     topic: str | None = None
     peer: Peer = ("", 0)
     listener: str = ""
-    case: PayloadCase | None = None
+    payloads: Sequence[tuple[PayloadCase, Fields]] = ()
     fields: Fields | None = None
     beside: Fields | None = None
     data: bytes | None = None
@@ -243,7 +243,7 @@ class Names:
 # given
 
 
-_KEYS_OF_DATAGRAMS = ("case", "fields", "envelope", "from", "listener", "trim", "pad")
+_KEYS_OF_DATAGRAMS = ("case", "fields", "cases", "envelope", "from", "listener", "trim", "pad")
 _KEYS_OF_MESSAGES = ("topic", "message")
 
 
@@ -264,23 +264,22 @@ class GivenReader:
         sender = optional_text(node, "from")
         if sender is None:
             raise InvalidValueError(span, Code.MISSING_KEY, "this datagram has no sender", "add 'from: ENDPOINT'")
-        named, data = optional_text(node, "case"), _hex(node)
-        if (named is None) == (data is None):
-            message = "write a datagram as 'case' with 'fields' or as 'hex', a ROS message with 'topic'"
+        data, forms = _hex(node), [key for key in ("case", "cases", "hex") if key in node.entries]
+        if len(forms) != 1:
+            message = "write a datagram as 'case' with 'fields', as 'cases' or as 'hex', a ROS message with 'topic'"
             raise InvalidValueError(span, Code.BAD_VALUE, message)
-        for key in ("fields", "envelope") if named is None else ():
-            if entry := node.entries.get(key):
+        for key, needed in (("fields", ["case"]), ("envelope", ["case", "cases"])):
+            if (entry := node.entries.get(key)) and forms[0] not in needed:
                 raise InvalidValueError(entry.key.span, Code.UNKNOWN_KEY, f"'{key}' needs 'case'")
-        case = self._names.case(named.value, named.span) if named else None
+        payloads = [*self._payloads(span, node)]
         pad = integer(node, "pad")
         times, every, age = _repetition(node)
         return Given(
             span=span,
             peer=self._names.peer(sender.value, sender.span),
             listener=self._names.listener(optional_text(node, "listener"), sender.value, span),
-            case=case,
-            fields=self._content(case.type, node.get("fields"), span) if case else None,
-            beside=self._content(self._names.beside(case), node.get("envelope"), span) if case else None,
+            payloads=payloads,
+            beside=self._content(self._names.beside(payloads[0][0]), node.get("envelope"), span) if payloads else None,
             data=data,
             trim=boolean(node, "trim"),
             pad=pad.value if pad else 0,
@@ -288,6 +287,15 @@ class GivenReader:
             every=every,
             age=age,
         )
+
+    def _payloads(self, span: SourceSpan, node: MappingNode) -> Iterator[tuple[PayloadCase, Fields]]:
+        if (named := optional_text(node, "case")) is not None:
+            case = self._names.case(named.value, named.span)
+            yield case, self._content(case.type, node.get("fields"), span)
+        several = node.get("cases")
+        for name, entry in several.entries.items() if isinstance(several, MappingNode) else ():
+            case = self._names.case(name, entry.key.span)
+            yield case, self._content(case.type, entry.value, entry.key.span)
 
     def _message(self, span: SourceSpan, node: MappingNode, topic: Located[str]) -> Given:
         _refuse(node, _KEYS_OF_DATAGRAMS, "a ROS message", _KEYS_OF_MESSAGES)
@@ -421,7 +429,7 @@ class ExpectedReader:
         """Return the fields as written; for 'unchanged', those of the step's given message."""
         if not _is(node, UNCHANGED):
             return self._fields.message(kind, node)
-        if not isinstance(given, MappingNode) or "hex" in given.entries:
+        if not isinstance(given, MappingNode) or given.entries.keys() & {"hex", "cases"}:
             raise InvalidValueError(node.span, Code.BAD_VALUE, "'unchanged' needs fields that are given in this step")
         fields = given.get("fields") or given.get("message")
         return self._given.message(kind, fields) if fields else Fields(kind, {}, node.span)

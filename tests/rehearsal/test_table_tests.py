@@ -426,6 +426,26 @@ IN_MEANING = [
     (f"{{given: {given(TEXT)}, expect: nothing}}", Code.WRONG_TYPE, "the text '1.5' is not a float32"),
     (f"{{given: {given('{is_calibrated: 1}')}, expect: nothing}}", Code.WRONG_TYPE, "'1' is not a bool"),
     (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
+    (
+        "{given: {cases: {imu: {}}, from: sensor_board, listener: exact}, expect: nothing}",
+        Code.UNKNOWN_PAYLOAD_CASE,
+        "payload case 'imu'",
+    ),
+    (
+        "{given: {cases: {imu_info: {}}, fields: {accel_x: 1}, from: sensor_board, listener: exact}, expect: nothing}",
+        Code.UNKNOWN_KEY,
+        "'fields' needs 'case'",
+    ),
+    (
+        "{given: {cases: {imu_info: {}}, case: imu_info, from: sensor_board, listener: exact}, expect: nothing}",
+        Code.BAD_VALUE,
+        "as 'case' with 'fields', as 'cases' or as 'hex'",
+    ),
+    (
+        "{given: {cases: {imu_info: {}}, from: '1.2.3.4', listener: exact}, expect: {published: {imu_data: unchanged}}}",
+        Code.BAD_VALUE,
+        "needs fields that are given",
+    ),
     ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
     ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),
     ("{expect: {sent: basestation}}", Code.BAD_VALUE, "needs a datagram that is given"),
@@ -472,6 +492,13 @@ def test_padding_that_is_too_small_is_found_when_the_test_runs(tmp_path: Path) -
     (result,) = run_tests(file)
     assert not result.passed
     assert [finding.code for finding in result.findings] == [Code.BAD_VALUE]
+
+
+def test_payloads_that_one_datagram_cannot_hold_are_found_when_the_test_runs(tmp_path: Path) -> None:
+    given_both = "{cases: {imu_info: {}, ph_info: {}}, from: sensor_board, listener: exact}"
+    [result] = run_tests(written(tmp_path, IMU, f"t: {{given: {given_both}, expect: any}}\n"))
+    [finding] = result.findings
+    assert (finding.code, finding.message) == (Code.BAD_VALUE, "PBEnvelope cannot hold imu_info and ph_info at once")
 
 
 def test_every_finding_of_a_file_is_told_at_once(tmp_path: Path) -> None:

@@ -74,13 +74,42 @@ def test_fields_beside_the_payload_are_shown_as_they_are_sent(
     table: str, case: str, inside: str, around: str, beside: object
 ) -> None:
     wire = wire_of(table)
-    data = envelope_of(wire, case, [*inside.split(), *around.split()])
+    data = envelope_of(wire, [case, *inside.split(), *around.split()])
     [told] = tapped_datagram(0, "board", data, wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == " ".join(filter(None, ("board", case, inside, around)))
     assert json.loads(told.json(with_hex=False)).get("envelope") == beside
     [sent] = shown(Action(2, SENT, "drive", "board", data=data), wire)
     assert sent.line(with_hex=False).endswith(" ".join(filter(None, (case, inside, around))))
     assert json.loads(sent.json(with_hex=False)).get("envelope") == beside
+
+
+def test_several_payload_cases_are_sent_in_one_datagram() -> None:
+    wire = wire_of("vision.yaml")
+    data = envelope_of(wire, ["geometry", "length=9", "envelope.camera=2", "detection", "frame=5"])
+    assert [each.line(with_hex=False).split(" ", 1)[1] for each in tapped_datagram(0, "camera", data, wire)] == [
+        "camera detection frame=5 envelope.camera=2",
+        "camera geometry length=9 envelope.camera=2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("table", "words", "complaint"),
+    [
+        ("vision.yaml", "detection frame=5 detection", "the payload case 'detection' is named twice"),
+        ("vision.yaml", "detection frame", "'frame' is neither a field with a value nor a payload case; write frame="),
+        (
+            "vision.yaml",
+            "detektion frame=5",
+            "vision.Wrapper has no payload case 'detektion'; did you mean 'detection'",
+        ),
+        ("named.yaml", "Status level=1 burt.Status", "WrappedMessage cannot hold Status and burt.Status at once"),
+        ("beside.yaml", "speed nested", "Frame cannot hold speed and nested at once"),
+    ],
+)
+def test_payload_cases_that_one_datagram_cannot_hold_are_refused(table: str, words: str, complaint: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        envelope_of(wire_of(table), words.split())
+    assert str(refused.value).startswith(complaint)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +124,7 @@ def test_fields_beside_the_payload_are_shown_as_they_are_sent(
 def test_a_condition_reads_fields_beside_the_payload(table: str, case: str, where: str, holds: bool) -> None:
     wire = wire_of(table)
     words = {"speed": "value=1.5 envelope.robot=3 envelope.mode=AUTONOMOUS", "detection": "envelope.camera=2"}
-    data = envelope_of(wire, case, words.get(case, "envelope.sequence=7").split())
+    data = envelope_of(wire, [case, *words.get(case, "envelope.sequence=7").split()])
     [told] = tapped_datagram(0, "board", data, wire)
     assert Filter((), Condition(where, wire.envelopes, [wire.case(case)])).takes(told, 0) is holds
 
