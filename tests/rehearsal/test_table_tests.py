@@ -442,8 +442,10 @@ IN_MEANING = [
         "as 'case' with 'fields', as 'cases' or as 'hex'",
     ),
     (
-        "{given: {cases: {imu_info: {}}, from: sensor_board, listener: exact}, "
-        "expect: {published: {imu_data: unchanged}}}",
+        (
+            "{given: {cases: {imu_info: {}}, from: sensor_board, listener: exact}, "
+            "expect: {published: {imu_data: unchanged}}}"
+        ),
         Code.BAD_VALUE,
         "needs fields that are given",
     ),
