@@ -37,9 +37,13 @@ TABLE = (
     Section("Checksum", "listen.NAME.checksum", "definitions.checksum.else"),
     Section("Endpoints", "endpoints.NAME", "definitions.endpoint"),
     Section("States", "state.NAME", "definitions.state"),
-    Section("Services", "services.NAME", "definitions.service"),
+    Section("Services", "services.NAME", "definitions.service.else"),
     Section("Requests of a service", "services.NAME.request", "definitions.service_request"),
     Section("Replies to a service", "services.NAME.reply", "definitions.service_reply"),
+    Section("Services that are called", "services.NAME", "definitions.service.then"),
+    Section("Messages that call a service", "services.NAME.from", "definitions.service_source"),
+    Section("Calls", "services.NAME.call", "definitions.service_call"),
+    Section("Replies to the caller", "services.NAME.reply", "definitions.called_reply"),
     Section("Routes", "routes.CASE", "definitions.route"),
     Section("Source topics", "routes.CASE.source", "definitions.source_topic"),
     Section("Destinations", "routes.CASE.destinations", "definitions.destination.then"),
@@ -232,9 +236,14 @@ class SchemaPage:
         yield "definitions.endpoint", rules["endpoints"]["additionalProperties"]["required"]
         yield "definitions.state", rules["state"]["additionalProperties"]["required"]
         service = rules["services"]["additionalProperties"]
-        yield "definitions.service", service["required"]
-        for key in ("request", "reply"):
-            yield f"definitions.service_{key}", service["properties"][key]["required"]
+        for form in ("then", "else"):
+            yield f"definitions.service.{form}", service[form]["required"]
+        inner = {form: service[form]["properties"] for form in ("then", "else")}
+        yield "definitions.service_request", inner["else"]["request"]["required"]
+        yield "definitions.service_reply", inner["else"]["reply"]["required"]
+        yield "definitions.service_source", inner["then"]["from"]["required"]
+        yield "definitions.service_call", inner["then"]["call"]["required"]
+        yield "definitions.called_reply", inner["then"]["reply"]["required"]
         route, gateway = complete["complete_route"]["else"], complete["complete_gateway"]["else"]
         yield "definitions.route", route["required"]
         yield "definitions.deadman", route["properties"]["deadman"]["else"]["required"]

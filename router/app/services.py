@@ -1,4 +1,4 @@
-"""Serves the ROS services of the running program, in a thread of its own.
+"""Serves and calls the ROS services of the running program, in a thread of its own.
 
 A service is rare, so its calls are paired with their replies in Python. Requests and replies are mapped natively, like
 all other messages, and no native thread waits for this one.
@@ -10,16 +10,18 @@ import os
 import select
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from threading import RLock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from router.app.change import Change
-from router.clock import boottime_ns
+from router.clock import boottime_ns, wall_ns
+from router.compiler.compiled_table import ANSWERED, CalledPlan, ServicePlan
 from router.compiler.metrics import CALL_BOUNDS_NS, CALL_OUTCOMES, HISTOGRAM_CELLS, Report
 from router.log import fault, logger
+from router.services.asking import Asking
 from router.services.calls import NEVER, Calls
 from router.threads import StuckError, Thread, join_or_abandon
 
@@ -31,9 +33,11 @@ if TYPE_CHECKING:
     from router.app.plane import Plane
     from router.app.topics import Topics
     from router.carrier.events import Reply
-    from router.compiler.compiled_table import CompiledTable, ServicePlan
+    from router.compiler.compiled_table import CompiledTable
     from router.observe.reports import Reporter
-    from router.ros.services import Request, ServedService
+    from router.ros.services import CallingClient, Request, ServedService
+
+T = TypeVar("T")
 
 _LOOK_S = 0.25
 """The longest time between two comparisons of the clocks."""
@@ -45,16 +49,17 @@ _TURN = 32
 
 @dataclass(slots=True)
 class ServiceChange:
-    """All services of the next program by name, the newly opened ones, and the unused old ones."""
+    """All services and clients of the next program by name, the newly opened ones, and the unused old ones."""
 
     served: dict[str, ServedService]
-    opened: list[ServedService]
-    unused: list[ServedService] = field(default_factory=list)
+    calling: dict[str, CallingClient]
+    opened: list[ServedService | CallingClient]
+    unused: list[ServedService | CallingClient] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
 class _Running:
-    """What calls use of a program: the routes of requests, and the counters, both by service."""
+    """What calls use of a program: the routes of messages to endpoints, and the counters, both by service."""
 
     routes: Mapping[str, ctypes.Array[c.RosRoute]]
     counters: Mapping[tuple[str, ...], int]
@@ -63,14 +68,14 @@ class _Running:
     def of(cls, program: CompiledTable, routes: Mapping[str, ctypes.Array[c.RosRoute]]) -> _Running:
         metrics = "service_calls_open", "service_call_seconds", "service_retries", "service_replies_unmatched"
         index, counters = program.counters.index, dict[tuple[str, ...], int]()
-        for plan in program.services:
-            counters |= {(metric, plan.name): index(metric, plan.name) for metric in metrics}
-            counters |= {(plan.name, outcome): index("service_calls", plan.name, outcome) for outcome in CALL_OUTCOMES}
+        for name in [*(plan.name for plan in program.services), *(plan.name for plan in program.called)]:
+            counters |= {(metric, name): index(metric, name) for metric in metrics}
+            counters |= {(name, outcome): index("service_calls", name, outcome) for outcome in CALL_OUTCOMES}
         return cls(routes, counters)
 
 
 class Services:
-    """The services of the running program. It is the effects of its calls (`services.calls.Effects`)."""
+    """The services of the running program. It is the effects of its calls: see `Effects` in `services`."""
 
     def __init__(self, topics: Topics, plane: Plane, counts: ThreadCounts, reporter: Reporter) -> None:
         self._topics, self._reporter = topics, reporter
@@ -78,6 +83,8 @@ class Services:
         self._counts = self._sender.counts
         self._lock = RLock()  # of everything below
         self._served: dict[str, ServedService] = {}
+        self._calling: dict[str, CallingClient] = {}
+        self._asking: Asking | None = None
         self._calls: Calls[tuple[ServedService, Request]] | None = None
         self._running = _Running({}, {})
         self._replies: deque[Reply] = deque()
@@ -97,18 +104,27 @@ class Services:
         """Open the services that are not open yet. Raises StartError, or StuckError if the thread is stuck."""
         self._acquire()
         self._lock.release()
-        served, opened = dict[str, "ServedService"](), list["ServedService"]()
+        node, opened = self._topics.node, list["ServedService | CallingClient"]()
+        served, calling = dict[str, "ServedService"](), dict[str, "CallingClient"]()
         with ExitStack() as undo:
             for plan in change.program.services:
                 kept = self._served.get(plan.name)
                 if kept is None or _is_other(kept.plan, plan):
-                    assert self._topics.node is not None  # noqa: S101 - opened for the services
-                    kept = self._topics.node.open_service(plan, self._eventfd)
+                    assert node is not None  # noqa: S101 - opened for the services
+                    kept = node.open_service(plan, self._eventfd)
                     opened.append(kept)
                     undo.callback(kept.close)
                 served[plan.name] = kept
+            for called in change.program.called:
+                client = self._calling.get(called.name)
+                if client is None or _is_other(client.plan, called):
+                    assert node is not None  # noqa: S101 - likewise
+                    client = node.open_client(called, self._eventfd)
+                    opened.append(client)
+                    undo.callback(client.close)
+                calling[called.name] = client
             undo.pop_all()
-        change.services = ServiceChange(served, opened)
+        change.services = ServiceChange(served, calling, opened)
 
     def undo(self, change: Change) -> None:
         """Close the services that `prepare` has opened."""
@@ -120,16 +136,18 @@ class Services:
         """End the open calls, and serve those of the next program."""
         assert change.services is not None  # noqa: S101 - prepared
         assert change.image is not None  # noqa: S101 - prepared
-        served, program = change.services.served, change.program
+        served, calling, program = change.services.served, change.services.calling, change.program
         with self._lock:
-            if self._calls is not None:
-                self._calls.end(boottime_ns())
-                self._note_open()
-            change.services.unused = [each for name, each in self._served.items() if served.get(name) is not each]
-            self._served = served
+            self._end()
+            unused: list[ServedService | CallingClient] = []
+            unused += [each for name, each in self._served.items() if served.get(name) is not each]
+            unused += [each for name, each in self._calling.items() if calling.get(name) is not each]
+            change.services.unused = unused
+            self._served, self._calling = served, calling
             self._running = _Running.of(program, change.image.requests())
             self._calls = Calls(program.services, program.envelopes, self)
-        if served and self._thread is None:
+            self._asking = Asking(program.called, self)
+        if (served or calling) and self._thread is None:
             self._thread = Thread(self._run, "services")
             self._thread.start()
         os.eventfd_write(self._eventfd, 1)
@@ -138,6 +156,13 @@ class Services:
         """Close the services that only the earlier program had."""
         for unused in change.services.unused if change.services else ():
             unused.close()
+
+    def _end(self) -> None:
+        """End the open calls."""
+        if self._calls is not None and self._asking is not None:
+            self._calls.end(boottime_ns())
+            self._asking.end(boottime_ns())
+            self._note_open()
 
     def _acquire(self) -> None:
         if not self._lock.acquire(timeout=_PATIENCE_S):
@@ -160,31 +185,42 @@ class Services:
 
     def _patience(self) -> float:
         """Return how long to wait, in ms."""
-        due = self._calls.due if self._calls is not None else NEVER
+        due = min(self._calls.due, self._asking.due) if self._calls and self._asking else NEVER
         wait = (due - boottime_ns()) / 1e6 if due != NEVER else _LOOK_S * 1e3
         return max(0.0, min(wait + 1, _LOOK_S * 1e3))
 
     def _serve(self) -> None:
         assert self._calls is not None  # noqa: S101 - the thread runs
+        assert self._asking is not None  # noqa: S101 - likewise
         self._sender.look()
         while self._replies:
             reply = self._replies.popleft()
             self._calls.reply(reply.service, reply.message, boottime_ns())
+            self._asking.request(reply.service, reply.message, boottime_ns())
+        for client in self._calling.values():
+            for response in self._turn(client.take):
+                self._asking.response(client.plan.label, response.number, response.message, boottime_ns())
         for served in self._served.values():
-            for _ in range(_TURN):
-                if (request := served.take()) is None:
-                    break
+            for request in self._turn(served.take):
                 caller = served, request
                 self._calls.call(served.plan.label, caller, request.message, request.called_at, boottime_ns())
-            else:
-                os.eventfd_write(self._eventfd, 1)
         self._calls.serve(boottime_ns())
+        self._asking.serve(boottime_ns())
         self._note_open()
 
+    def _turn(self, take: Callable[[], T | None]) -> Iterator[T]:
+        """Take what has arrived, but not too much at once."""
+        for _ in range(_TURN):
+            if (taken := take()) is None:
+                return
+            yield taken
+        os.eventfd_write(self._eventfd, 1)
+
     def _note_open(self) -> None:
-        if self._calls is not None:
-            for name, number in self._calls.open_calls().items():
-                self._counts[self._running.counters["service_calls_open", name]] = number
+        if self._calls is None or self._asking is None:
+            return
+        for name, number in {**self._calls.open_calls(), **self._asking.open_requests()}.items():
+            self._counts[self._running.counters["service_calls_open", name]] = number
 
     # effects of calls
 
@@ -203,18 +239,38 @@ class Services:
             logger.warning("a response could not be sent", service=plan.name, problem=str(error))
 
     def ended(self, plan: ServicePlan, outcome: str, duration: int) -> None:
+        self._count(plan.name, plan.endpoint, outcome, duration)
+
+    def _count(self, name: str, other: str, outcome: str, duration: int) -> None:
+        """Count a call, which `other` should have answered."""
         counters = self._running.counters
-        self._counts[counters[plan.name, outcome]] += 1
-        histogram = counters["service_call_seconds", plan.name]
+        self._counts[counters[name, outcome]] += 1
+        histogram = counters["service_call_seconds", name]
         self._counts[histogram + bisect_left(CALL_BOUNDS_NS, duration)] += 1
         self._counts[histogram + HISTOGRAM_CELLS - 1] += duration
-        if outcome in ("timed_out", "unsent", "refused", "busy"):
-            self._reporter.report(Report("call", plan.name, plan.endpoint, outcome))
+        if outcome not in (ANSWERED, "cancelled"):
+            self._reporter.report(Report("call", name, other, outcome))
 
     def unmatched(self, plan: ServicePlan, number: int | None) -> None:
         self._counts[self._running.counters["service_replies_unmatched", plan.name]] += 1
         detail = f"number {number}" if number is not None else ""
         self._reporter.report(Report("reply", plan.name, "", "unmatched", None, detail))
+
+    # effects of requests of endpoints
+
+    def ask(self, plan: CalledPlan, request: bytes) -> int | None:
+        try:
+            return self._calling[plan.name].ask(request)
+        except RuntimeError as error:  # of rcl
+            logger.warning("a service could not be called", service=plan.service, problem=str(error))
+            return None
+
+    def reply(self, plan: CalledPlan, message: bytes, *, is_response: bool) -> bool:
+        route = self._running.routes[plan.label if is_response else plan.failed]
+        return not isinstance(self._sender.send(route, message, wall_ns()), str)
+
+    def finished(self, plan: CalledPlan, outcome: str, duration: int) -> None:
+        self._count(plan.name, plan.service, outcome, duration)
 
     # stopping
 
@@ -225,15 +281,19 @@ class Services:
         if self._thread is not None and not join_or_abandon(self._thread):
             self._topics.leave_open()
             return
-        if self._calls is not None:
-            self._calls.end(boottime_ns())
-            self._note_open()
+        self._end()
         for served in self._served.values():
             served.close()
+        for client in self._calling.values():
+            client.close()
         self._sender.close()
 
 
-def _is_other(kept: ServicePlan, plan: ServicePlan) -> bool:
-    """Return whether ROS needs another service."""
-    names = (kept.ros_name, kept.type_name, kept.definitions)
-    return names != (plan.ros_name, plan.type_name, plan.definitions)
+def _is_other(kept: ServicePlan | CalledPlan, plan: ServicePlan | CalledPlan) -> bool:
+    """Return whether ROS needs another service or client."""
+
+    def key(each: ServicePlan | CalledPlan) -> tuple[object, ...]:
+        name = each.ros_name if isinstance(each, ServicePlan) else each.service
+        return name, each.type_name, each.definitions
+
+    return key(kept) != key(plan)

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from router.compiler.beside import check_beside, unfilled
 from router.compiler.brakes import brake_findings
-from router.compiler.checked import CheckedRoute, CheckedService, CheckedState
+from router.compiler.called import check_called
+from router.compiler.checked import CheckedCalled, CheckedRoute, CheckedService, CheckedState
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
@@ -71,6 +72,7 @@ class Checked:
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
     states: Mapping[str, CheckedState] = field(default_factory=dict)
     services: Sequence[CheckedService] = ()
+    called: Sequence[CheckedCalled] = ()
     lowered: Lowered | None = None
 
     @property
@@ -120,6 +122,7 @@ def check_table(
     states = check_states(lookup)
     own_routes = check_routes(lookup)
     services, routes = check_services(lookup, own_routes)
+    called, routes = check_called(lookup, routes)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
     own_type = lookup.ros_type(own) if own else None
@@ -156,6 +159,7 @@ def check_table(
         own_topics,
         states,
         services,
+        called,
         lowered,
     )
 
@@ -185,6 +189,7 @@ def _limits(table: RouteTable, envelope: Envelope, lock: LockComparison) -> Boar
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
     named = {route.case.value for route in table.routes}
     named |= {service.request.case.value for service in table.services.values()}
+    named |= {service.reply.case.value for service in table.called.values()}
     named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
     cases = [case for name, case in envelope.cases.items() if name in named]
     longest, payloads = lock.max_size or envelope.max_size, payload_fields(envelope, cases, schema.board_options)

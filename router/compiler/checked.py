@@ -14,7 +14,7 @@ from router.compiler.plan import Record
 from router.errors import SourceSpan
 from router.table.model.endpoints import Endpoint, EndpointKind
 from router.table.model.routes import Route
-from router.table.model.services import Service
+from router.table.model.services import CalledService, Service
 from router.table.model.state import State
 from router.table.model.targets import Destination, OnLimit, Priority, Topic
 from router.types.model import MessageType
@@ -132,6 +132,16 @@ class CheckedService:
     def group(self) -> tuple[str, str]:
         """The payload case of the replies, and their sender."""
         return self.reply_case.name, (self.declared.reply.sender or self.declared.request.to).value
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedCalled:
+    """A service that an endpoint calls, whose payload cases and types exist. `kept` is as in CalledPlan."""
+
+    declared: CalledService
+    request_type: MessageType
+    response_type: MessageType
+    kept: int
 
 
 @dataclass(frozen=True, slots=True)

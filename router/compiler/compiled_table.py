@@ -53,6 +53,14 @@ OUTCOMES: Mapping[str, str] = {
 }
 """How a call ends without a reply, with the text of `reason` in `on_timeout`."""
 
+CALL_FAILURES: Mapping[str, str] = {
+    "timed_out": "{service} did not respond within {timeout}",
+    "busy": "too many calls of {service} are open",
+    "unsent": "there is no server of {service}",
+    "cancelled": "the router has reloaded its table, or stops",
+}
+"""How a call that an endpoint makes ends without a response, with the text of `reason` in `on_timeout`."""
+
 ANSWERED = "answered"
 """The outcome of a call with a reply."""
 
@@ -251,6 +259,32 @@ class ServicePlan:
 
 
 @dataclass(frozen=True, slots=True)
+class CalledPlan:
+    """A ROS service that an endpoint calls. `timeout` is in ns, `reasons` has texts by outcome (CALL_FAILURES).
+
+    `service` is the name of the service in ROS, as the table writes it. `kept` is the number of bytes before its
+    request, which its reply gets. `failed` is the label of replies without a response.
+    """
+
+    name: str
+    service: str
+    type_name: str
+    definitions: Mapping[str, tuple[tuple[str, str], ...]]
+    kept: int
+    timeout: int
+    reasons: Mapping[str, str]
+    span: SourceSpan
+
+    @property
+    def label(self) -> str:
+        return service_label(self.name)
+
+    @property
+    def failed(self) -> str:
+        return f"{self.label}.on_timeout"
+
+
+@dataclass(frozen=True, slots=True)
 class InboundPlan:
     """A topic that a gateway's clients may publish on; `label` is its absolute name, which clients use.
 
@@ -317,6 +351,7 @@ class CompiledTable:
     gateways: tuple[GatewayPlan, ...] = ()
     states: tuple[StatePlan, ...] = ()
     services: tuple[ServicePlan, ...] = ()
+    called: tuple[CalledPlan, ...] = ()
     named: CompiledTable | None = None
 
     @property
@@ -342,7 +377,17 @@ class CompiledTable:
     @property
     def uses_ros(self) -> bool:
         """Whether it needs a ROS node."""
-        return bool(self.publishers or self.subscriptions or self.gateways or self.services)
+        return bool(self.publishers or self.subscriptions or self.gateways or self.service_labels)
+
+    @property
+    def service_labels(self) -> list[str]:
+        """What stands for services in place of topics."""
+        return [*(plan.label for plan in self.services), *(plan.label for plan in self.called)]
+
+    @property
+    def request_labels(self) -> list[str]:
+        """What stands for services as the source of messages."""
+        return [*self.service_labels, *(plan.failed for plan in self.called)]
 
     @property
     def client_deadmen(self) -> list[DeadmanPlan]:

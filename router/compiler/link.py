@@ -8,9 +8,18 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from router.compiler.checked import CheckedRoute, CheckedService, CheckedState, CheckedSubscription, Target
+from router.compiler.checked import (
+    CheckedCalled,
+    CheckedRoute,
+    CheckedService,
+    CheckedState,
+    CheckedSubscription,
+    Target,
+)
 from router.compiler.compiled_table import (
+    CALL_FAILURES,
     STRANGER,
+    CalledPlan,
     CompiledTable,
     GatewayPlan,
     RoutePlan,
@@ -27,6 +36,7 @@ from router.compiler.topics import qos_of
 from router.table.model import RouteTable
 from router.table.model.routes import ANY, Route
 from router.table.model.targets import Topic
+from router.table.units import duration
 from router.types.model import MessageType
 
 if TYPE_CHECKING:
@@ -57,7 +67,8 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     services = tuple(map(_service, checked.services))
-    labels = {service.label for service in services}
+    called = tuple(map(_called, checked.called))
+    labels = {*(plan.label for plan in services), *(name for plan in called for name in (plan.label, plan.failed))}
     program = CompiledTable(
         table=table,
         envelopes=envelopes,
@@ -77,6 +88,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
         boards=checked.boards,
         gateways=tuple(checked.gateways),
         services=services,
+        called=called,
         states=tuple(_state(state, lowered, inbound, served) for state in checked.states.values()),
     )
     open_series(program)
@@ -121,6 +133,21 @@ def _service(checked: CheckedService) -> ServicePlan:
         retries=declared.retries,
         responses=checked.responses,
         span=declared.span,
+    )
+
+
+def _called(checked: CheckedCalled) -> CalledPlan:
+    call = checked.declared.call
+    words = {"service": call.service.value, "timeout": duration(call.timeout.value)}
+    return CalledPlan(
+        name=checked.declared.name,
+        service=call.service.value,
+        type_name=call.type.value,
+        definitions=definitions_of(checked.request_type) | definitions_of(checked.response_type),
+        kept=checked.kept,
+        timeout=call.timeout.value,
+        reasons={outcome: text.format(**words) for outcome, text in CALL_FAILURES.items()},
+        span=checked.declared.span,
     )
 
 

@@ -313,11 +313,11 @@ INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """The DROP_REASONS that apply to messages of clients."""
 
 CALL_OUTCOMES: Mapping[str, str] = {
-    "answered": "the endpoint replied",
+    "answered": "the endpoint replied; with `call`, the server responded",
     "timed_out": "no reply came within `timeout`, after all `retries`",
-    "busy": "an earlier call was open, and without `match` there is one at a time",
-    "unsent": "the endpoint could not be sent to",
-    "refused": "the call was older than `ttl`, or its values do not fit the request",
+    "busy": "an earlier call was open, and without `match` there is one at a time; with `call`, 64 were open",
+    "unsent": "the endpoint could not be sent to; with `call`, there was no server",
+    "refused": "the call was older than `ttl`, or its values do not fit the request; with `call`, the reply",
     "cancelled": "a reload or the stop of the router ended it",
 }
 """How a call of a service ends, with the meaning."""

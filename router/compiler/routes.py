@@ -41,6 +41,7 @@ def _coverage(lookup: Lookup) -> None:
     table, cases, unroutable = lookup.table, lookup.envelopes.cases, lookup.envelopes.unroutable
     names = [route.case.value for route in table.routes]
     names += [each.case.value for service in table.services.values() for each in (service.request, service.reply)]
+    names += [each.case.value for service in table.called.values() for each in (service.source, service.reply)]
     # a misspelt case is one finding, not two
     covered = {name if name in cases else nearest(name, cases) for name in names if name not in unroutable}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}

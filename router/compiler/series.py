@@ -42,7 +42,7 @@ def open_series(program: CompiledTable) -> None:
     counters, table = program.counters, program.table
     _open_listeners(counters, table, program.envelopes)
     _open_own(counters, table)
-    services = {service.label for service in program.services}
+    services = program.request_labels
     for plan in program.routes:
         _open_route(counters, table, plan, services)
     for deadman in program.deadmen:
@@ -51,9 +51,9 @@ def open_series(program: CompiledTable) -> None:
         _open_gateway(counters, gateway)
     for state in program.states:
         _open_state(counters, state)
-    for service in program.services:
-        _open_each(counters, "service_calls", service.name, last=CALL_OUTCOMES)
-        _open(counters, _OF_SERVICES, service.name)
+    for name in [*(plan.name for plan in program.services), *(plan.name for plan in program.called)]:
+        _open_each(counters, "service_calls", name, last=CALL_OUTCOMES)
+        _open(counters, _OF_SERVICES, name)
 
 
 def _open(counters: Counters, metrics: Iterable[str], *labels: str) -> None:

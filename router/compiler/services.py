@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from router.compiler.checked import CheckedRoute, CheckedService, Target
+from router.compiler.checked import CheckedRoute, CheckedService, CheckedSubscription, Target
 from router.compiler.compiled_table import MOST_CALLS, OUTCOMES, service_label
 from router.compiler.constants import cdr_of
 from router.compiler.conversion import convert
@@ -49,7 +49,8 @@ def check_services(
         service, reply = checked
         services.append(service)
         all_routes.append(service.request)
-        _add(lookup, all_routes, service, reply)
+        sender = declared.reply.sender or declared.request.to
+        add_target(lookup, all_routes, declared.reply.case, service.reply_case, sender, reply)
     lookup.findings += _ambiguous(services)
     return tuple(services), tuple(all_routes)
 
@@ -59,7 +60,7 @@ def _checked(lookup: Lookup, declared: Service) -> tuple[CheckedService, Target]
     endpoints = [lookup.endpoint(name) for name in filter(None, (declared.request.to, declared.reply.sender))]
     if request_case is None or reply_case is None or None in endpoints:
         return None
-    halves = _type(lookup, declared.type)
+    halves = service_type(lookup, declared.type)
     if halves is None:
         return None
     lookup.findings += [*_age_findings(lookup, declared), *_brake_findings(lookup, declared)]
@@ -76,7 +77,7 @@ def _checked(lookup: Lookup, declared: Service) -> tuple[CheckedService, Target]
     return CheckedService(declared, name, *halves, request, reply_case, path, responses), reply
 
 
-def _type(lookup: Lookup, name: Located[str]) -> tuple[MessageType, MessageType] | None:
+def service_type(lookup: Lookup, name: Located[str]) -> tuple[MessageType, MessageType] | None:
     """Return the request and the response of a service type, or None with a finding."""
     interfaces = lookup.definitions.interfaces
     try:
@@ -111,13 +112,27 @@ def _request(lookup: Lookup, declared: Service, case: PayloadCase, message: Mess
         no_ttl=asked.no_ttl,
     )
     numbered = _numbered(message, Int(64, signed=False))
-    before = len(lookup.findings)
-    recipients, names = destinations(lookup, route, case), {SEQUENCE: _sequence(numbered, declared.span)}
+    names = {SEQUENCE: _sequence(numbered, declared.span)}
+    return CheckedRoute(route, case, subscriptions=feeds(lookup, route, case, message, numbered, names))
+
+
+def feeds(
+    lookup: Lookup,
+    route: Route,
+    case: PayloadCase,
+    message: MessageType,
+    numbered: MessageType,
+    names: Mapping[str, Node],
+) -> tuple[CheckedSubscription, ...]:
+    """Check the messages that a service sends to its endpoint. They feed no deadman, and never wait."""
+    before, (topic,) = len(lookup.findings), route.source_topics
+    recipients = destinations(lookup, route, case)
     feed = subscription(lookup, route, case, topic, message, recipients, numbered, names)
     if not message.fields:  # then nothing can fill the payload
         lookup.findings[before:] = [each for each in lookup.findings[before:] if each.code is not Code.NOTHING_MAPPED]
-    targets = tuple(replace(each, deadmen=(), is_request=True) for each in feed.targets) if feed else ()
-    return CheckedRoute(route, case, subscriptions=(replace(feed, targets=targets),) if feed else ())
+    if feed is None:
+        return ()
+    return (replace(feed, targets=tuple(replace(each, deadmen=(), is_request=True) for each in feed.targets)),)
 
 
 def _sequence(numbered: MessageType, span: SourceSpan) -> Node:
@@ -127,8 +142,13 @@ def _sequence(numbered: MessageType, span: SourceSpan) -> Node:
 
 def _numbered(message: MessageType, number: Int) -> MessageType:
     """Return the message with a number before it. Its name is no name of a field, so expressions cannot read it."""
+    return behind(message, Field("(number)", number))
+
+
+def behind(message: MessageType, *first: Field) -> MessageType:
+    """Return the message with other fields before its own."""
     fields = message.fields or (Field("structure_needs_at_least_one_member", Int(8, signed=False)),)
-    return MessageType(message.name, (Field("(number)", number), *fields), message.constants)
+    return MessageType(message.name, (*first, *fields), message.constants)
 
 
 def _age_findings(lookup: Lookup, declared: Service) -> Iterator[Diagnostic]:
@@ -244,34 +264,46 @@ def _mapped(mapping: FieldMapping, message: MessageType) -> FieldMapping:
     return mapping if message.fields else replace(mapping, findings=[])
 
 
-def _add(lookup: Lookup, routes: list[CheckedRoute], service: CheckedService, reply: Target) -> None:
-    """Add the target of replies to the route that takes them, or add a route."""
-    declared, case = service.declared.reply, service.reply_case
-    sender = declared.sender or service.declared.request.to
-    same = [index for index, each in enumerate(routes) if each.case.name == case.name and not each.subscriptions]
-    for index in same:
-        route = routes[index].route
-        taken = [source.value for source in route.sources]
-        if route.ignore is not None:
-            message = f"'{case.name}' is ignored, so no reply arrives"
-            lookup.report(declared.case.span, Code.BAD_VALUE, message, f"remove `ignore`: see {route.span}")
-            return
-        if route.collect is not None and sender.value in taken:
-            message = f"a route collects '{case.name}' from '{sender.value}' into frames, so no reply arrives alone"
-            lookup.report(declared.case.span, Code.SOURCE_CLASH, message, f"remove `collect`: see {route.span}")
+def add_target(
+    lookup: Lookup,
+    routes: list[CheckedRoute],
+    named: Located[str],
+    case: PayloadCase,
+    sender: Located[str],
+    target: Target,
+) -> None:
+    """Add a service as the target of messages of a case to the route that takes them, or add a route."""
+    for index, checked in enumerate(routes):
+        route, taken = checked.route, [source.value for source in checked.route.sources]
+        if checked.case.name != case.name or checked.subscriptions:
+            continue
+        if (clash := _clash(route, case.name, sender.value)) is not None:
+            code, message, hint = clash
+            lookup.report(named.span, code, message, f"{hint}: see {route.span}")
             return
         if taken == [sender.value]:
-            routes[index] = replace(routes[index], targets=(*routes[index].targets, reply))
-            return
-        if sender.value in taken or ANY in taken:
-            message = f"a route takes '{case.name}' from '{sender.value}' and others"
-            hint = f"write a list of routes, one of them only from '{sender.value}': see {route.span}"
-            lookup.report(declared.case.span, Code.SOURCE_CLASH, message, hint)
+            routes[index] = replace(checked, targets=(*checked.targets, target))
             return
     names = {each.route.name for each in routes}
-    name = case.name if not names & {case.name} else f"{case.name}_from_{sender.value}"
-    route = Route(name=name, span=declared.span, case=declared.case, sources=(sender,))
-    routes.append(CheckedRoute(route, case, (reply,)))
+    name = case.name if case.name not in names else f"{case.name}_from_{sender.value}"
+    route = Route(name=name, span=target.span, case=named, sources=(sender,))
+    routes.append(CheckedRoute(route, case, (target,)))
+
+
+def _clash(route: Route, case: str, sender: str) -> tuple[Code, str, str] | None:
+    """Return why a route keeps a service from getting messages of a case from `sender`, and the remedy; else None."""
+    taken = [source.value for source in route.sources]
+    if route.ignore is not None:
+        return Code.BAD_VALUE, f"'{case}' is ignored, so the service does not get it", "remove `ignore`"
+    if sender not in taken and ANY not in taken:
+        return None
+    if taken != [sender]:
+        hint = f"write a list of routes, one of them only from '{sender}'"
+        return Code.SOURCE_CLASH, f"a route takes '{case}' from '{sender}' and others", hint
+    if route.collect is not None:
+        message = f"a route collects '{case}' from '{sender}' into frames, so the service does not get it alone"
+        return Code.SOURCE_CLASH, message, "remove `collect`"
+    return None
 
 
 def _ambiguous(services: Iterable[CheckedService]) -> Iterator[Diagnostic]:

@@ -202,7 +202,7 @@ class TargetWriter:
 
     def _topic(self, topic: str) -> c.Target:
         if topic not in self._topics:
-            is_service = any(service.label == topic for service in self.program.services)
+            is_service = topic in self.program.service_labels
             self._topics[topic] = self.arrays.add(self._service() if is_service else self._published(topic))
         return c.Target(topic=ctypes.pointer(self._topics[topic]))
 

@@ -43,7 +43,7 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
     structure = arrays.add(_Writer(program, targets, numbers, columns).program_of(plans))
     ros = {topic: _ros_routes(targets, topic, feeds) for topic, feeds in program.lowered.from_ros.items()}
-    services = [service.label for service in program.services]
+    services = program.request_labels
     for client_deadman in program.client_deadmen:
         openings.client_deadman(client_deadman)
     memory = Memory(arrays)

@@ -113,7 +113,7 @@ def _topics(program: CompiledTable, node: NodeSettings) -> dict[str, str]:
     """Return the topics and services as the table writes them, by absolute name."""
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [entry.topic.topic.value for gateway in program.gateways for entry in gateway.settings.inbound]
-    services = [plan.name for plan in program.services]
+    services = [*(plan.name for plan in program.services), *(plan.service for plan in program.called)]
     return {resolved(name, node): name for name in (*plans, *inbound, *services)}
 
 

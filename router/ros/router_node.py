@@ -8,7 +8,7 @@ from functools import partial
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from router.compiler.compiled_table import ServicePlan, TopicPlan
+from router.compiler.compiled_table import CalledPlan, ServicePlan, TopicPlan
 from router.declared import Demand
 from router.errors import SourceSpan
 from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
@@ -16,7 +16,7 @@ from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJ
 from router.ros.graph import GraphWatch, Ours, Surroundings
 from router.ros.marks import Mark
 from router.ros.node import close_node, open_node
-from router.ros.services import ServedService
+from router.ros.services import CallingClient, ServedService
 from router.ros.topics import RosTopics
 from router.table.model.settings import NodeSettings
 
@@ -111,6 +111,10 @@ class RouterNode:
     def open_service(self, plan: ServicePlan, eventfd: int) -> ServedService:
         """Open a service whose requests add to `eventfd`, for the caller to close. Raises StartError."""
         return ServedService(self._node, plan, eventfd)
+
+    def open_client(self, plan: CalledPlan, eventfd: int) -> CallingClient:
+        """Open a client of a service whose responses add to `eventfd`, likewise."""
+        return CallingClient(self._node, plan, eventfd)
 
     def undo(self, change: RosChange) -> None:
         """Close the endpoints that `prepare` has opened."""

@@ -1,4 +1,4 @@
-"""Services of the node, whose requests and responses are CDR bytes."""
+"""Services and clients of the node, whose requests and responses are CDR bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from router.clock import wall_ns
-from router.compiler.compiled_table import ServicePlan
+from router.compiler.compiled_table import CalledPlan, ServicePlan
 from router.ros.node import RCL_ERRORS, start_error
 from router.ros.rcl import RCL
 from router.ros.receiving import ADD_TO_EVENTFD
@@ -24,7 +24,8 @@ default, and loses the others without a word.
 """
 
 _set_callback = RCL.rcl_service_set_on_new_request_callback
-_set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+_set_callback_of_client = RCL.rcl_client_set_on_new_response_callback
+_set_callback.argtypes = _set_callback_of_client.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class Request(NamedTuple):
@@ -33,6 +34,13 @@ class Request(NamedTuple):
     message: bytes
     header: Any
     called_at: int
+
+
+class Response(NamedTuple):
+    """A response to the request with this number."""
+
+    number: int
+    message: bytes
 
 
 class ServedService:
@@ -75,3 +83,45 @@ class ServedService:
     def close(self) -> None:
         _set_callback(self._service.handle.pointer, None, None)
         self._node.destroy_service(self._service)
+
+
+class CallingClient:
+    """A client of the node. Responses add to an eventfd. For one thread."""
+
+    def __init__(self, node: Node, plan: CalledPlan, eventfd: int) -> None:
+        """Open the client. Raises StartError if its type is not installed, or the middleware refuses it."""
+        self.plan = plan
+        self._node = node
+        self._type = service_class(plan.type_name, plan.definitions, plan.span)
+        try:
+            self._client = node.create_client(
+                self._type,
+                plan.service,
+                qos_profile=QoSProfile(depth=MOST_WAITING),
+                callback_group=ReentrantCallbackGroup(),
+            )
+            for _ in range(2):
+                if _set_callback_of_client(self._client.handle.pointer, ADD_TO_EVENTFD, eventfd):
+                    raise rclpy_implementation.RCLError("the middleware does not report new responses")
+        except RCL_ERRORS as error:
+            raise start_error(error, f"{plan.span}: service '{plan.service}' cannot be called: {error}") from error
+
+    def ask(self, request: bytes) -> int | None:
+        """Send a request, and return its number; None without a server. Raises one of RCL_ERRORS."""
+        if not self._client.service_is_ready():
+            return None
+        handle = self._client.handle
+        with handle:
+            number: int = handle.send_request(deserialize_message(request, self._type.Request))
+        return number
+
+    def take(self) -> Response | None:
+        """Return the oldest response; None if there is none. Raises one of RCL_ERRORS."""
+        handle = self._client.handle
+        with handle:
+            header, response = handle.take_response(self._type.Response)
+        return None if header is None else Response(header.request_id.sequence_number, serialize_message(response))
+
+    def close(self) -> None:
+        _set_callback_of_client(self._client.handle.pointer, None, None)
+        self._node.destroy_client(self._client)

@@ -1,1 +1,1 @@
-"""Calls of ROS services that endpoints answer."""
+"""Calls of ROS services that endpoints answer, and of ROS services by endpoints."""

@@ -23,7 +23,7 @@ Caller_contra = TypeVar("Caller_contra", contravariant=True)
 NEVER = (1 << 63) - 1
 """When nothing is due."""
 
-_HEADER, _NUMBER = 4, 8
+HEADER, _NUMBER = 4, 8
 """Bytes of a message before its number, and of the number."""
 
 
@@ -169,13 +169,13 @@ def number_in(envelope: Envelope, datagram: bytes, match: tuple[str, ...]) -> in
 
 
 def _with_number(message: bytes, number: int) -> bytes:
-    return message[:_HEADER] + struct.pack("<Q", number) + message[_HEADER:]
+    return message[:HEADER] + struct.pack("<Q", number) + message[HEADER:]
 
 
 def _number_of(message: bytes) -> int:
-    (number,) = struct.unpack_from("<Q", message, _HEADER)
+    (number,) = struct.unpack_from("<Q", message, HEADER)
     return int(number)
 
 
 def _without_number(message: bytes) -> bytes:
-    return message[:_HEADER] + message[_HEADER + _NUMBER :]
+    return message[:HEADER] + message[HEADER + _NUMBER :]

@@ -37,7 +37,7 @@ from router.table.model.gateways import (
 )
 from router.table.model.routes import ROS, Deadman, Obeyed, Payload, Route
 from router.table.model.serial import Checksum, ChecksumKind, SerialLine, StreamFraming
-from router.table.model.services import Service, ServiceRequest
+from router.table.model.services import CalledService, Service, ServiceRequest
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
 from router.table.model.targets import Destination, Topic
@@ -104,6 +104,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         return None
     listeners = builder.each(root, "listen", _listener)
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
+    services = builder.each(root, "services", _service)
     defaults = root.get("defaults")
     if defaults is not None and defaults.broken:
         builder.broken.add("package")  # it may be the broken part
@@ -126,7 +127,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         reload_on_change=builder.one(root, "reload", _reload) or False,
         networks=builder.one(root, "networks", _networks),
         states=builder.each(root, "state", _state),
-        services=builder.each(root, "services", _service),
+        services={name: service for name, service in services.items() if isinstance(service, Service)},
+        called={name: service for name, service in services.items() if isinstance(service, CalledService)},
         broken=frozenset(builder.broken),  # last: the others add to it
     )
 
@@ -287,8 +289,10 @@ def _state(entry: Entry) -> State:
     return structure(State, settings, name=entry.key.text, span=entry.key.span, topic=topic)
 
 
-def _service(entry: Entry) -> Service:
+def _service(entry: Entry) -> Service | CalledService:
     settings = mapping(entry.value)
+    if "call" in settings.entries:
+        return structure(CalledService, settings, name=entry.key.text, span=entry.key.span)
     asked = settings.entries["request"]
     request = structure(ServiceRequest, mapping(asked.value), **_without_ttl(mapping(asked.value)), span=asked.key.span)
     on_timeout = _constants(settings.entries["on_timeout"])

@@ -197,7 +197,9 @@ def _owners(name: str, path: Path) -> str:
     if path and path[0] == "listen" and "listener" in owners:
         return "remove it: a listener with 'address' and one with 'serial' have different keys"
     if path[:1] != ("services",):
-        owners = [owner for owner in owners if not owner.startswith("service")]
+        owners = [owner for owner in owners if not owner.startswith(("service", "called"))]
+    elif "service" in owners:
+        return "remove it: a service that a board answers and one with 'call' have different keys"
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
     named = [_NAMES[owner] for owner in near]
     named += ["the top level"] if name in keys_of(table_schema()) else []
@@ -226,6 +228,9 @@ _NAMES = {
     "service": "a service",
     "service_request": "the 'request' of a service",
     "service_reply": "the 'reply' of a service",
+    "service_source": "'from'",
+    "service_call": "'call'",
+    "called_reply": "the 'reply' of a service",
     "listener": "a listener",
     "stream_framing": "'framing' of a serial line",
     "checksum": "'checksum' of a serial line",

@@ -144,6 +144,11 @@ class MessageType:
         return next((member for member in self.fields if member.name == name), None)
 
     @property
+    def names(self) -> list[str]:
+        """The names of the fields that a table can write, without those that the router adds: `(number)`."""
+        return [member.name for member in self.fields if not member.name.startswith("(")]
+
+    @property
     def short_name(self) -> str:
         """`Imu` of `sensor_msgs/msg/Imu`; `State` of `MotorInformation.State`."""
         return self.name.replace("/", ".").rpartition(".")[2]

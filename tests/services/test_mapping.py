@@ -121,7 +121,7 @@ def test_the_example_of_the_reference_is_a_table(tmp_path: Path) -> None:
     assert found is not None
     table = tmp_path / "table.yaml"
     head = f"version: 1\nenvelope: {{protos: {CALLS}, message: PBEnvelope, oneof: payload}}\n"
-    others = "listen: {rover: {address: 192.168.0.1:5000}}\nroutes: {drive: {ignore: later}, log: {ignore: later}}\n"
+    others = "listen: {rover: {address: 192.168.0.1:5000}}\nroutes: {drive: {ignore: no use}, log: {ignore: no use}}\n"
     table.write_text(head + found[1] + others)
     assert list(map(str, check_table(table, {}).diagnostics)) == []
 

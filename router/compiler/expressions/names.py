@@ -252,7 +252,7 @@ def member_of(holder: Node, node: ast.Attribute, text: Parsed, scope: Scope) -> 
             raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
         if further := _further(holder.kind.type, node, text):
             raise ExpressionError(text.span(text.outermost(node)), Code.UNKNOWN_FIELD, message, one_of(further))
-        hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
+        hint = did_you_mean(node.attr, holder.kind.type.names)
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
     return _readable(field_of(holder, member, span))
 

@@ -54,7 +54,7 @@ class Scope:
 
     def field_names(self) -> list[str]:
         """Return the fields of the message and the additional variables."""
-        return [*self.names, *(member.name for member in self.message.fields)]
+        return [*self.names, *self.message.names]
 
     def variable(self, name: str, span: SourceSpan) -> Node:
         """Return one of `names`, positioned at `span`."""

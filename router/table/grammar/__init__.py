@@ -146,7 +146,8 @@ _KEYS: Schema = {
     "services": key(
         "Services",
         "ROS services that boards answer: a call becomes a message to a board, and the board's reply the response. By "
-        "the name of the service in ROS, which is resolved in the node's namespace.",
+        "the name of the service in ROS, which is resolved in the node's namespace. With 'call', a ROS service that a "
+        "board calls, by any name.",
         {
             "default": {},
             "type": "object",

@@ -28,7 +28,7 @@ from router.table.keys import Key, Listed, OneOf, Range, Shape, keys_of
 from router.table.model.expressions import Expression, FieldMap
 from router.table.model.gateways import GatewayFormat, InboundDeadman, TopicRate
 from router.table.model.routes import Collect, Deadman, Payload
-from router.table.model.services import ServiceReply, ServiceRequest
+from router.table.model.services import CalledReply, ServiceCall, ServiceReply, ServiceRequest, ServiceSource
 from router.table.model.targets import Qos
 
 Schema = dict[str, Any]
@@ -52,7 +52,10 @@ _DEFINED: Mapping[type, str] = {
     TopicRate: "topic_rates",
 }
 """Types of values, and their definitions if these are named differently."""
-_DESCRIBED = (Collect, Deadman, FieldMap, InboundDeadman, Qos, ServiceReply, ServiceRequest)
+_DESCRIBED = (
+    *(Collect, Deadman, FieldMap, InboundDeadman, Qos),
+    *(CalledReply, ServiceCall, ServiceReply, ServiceRequest, ServiceSource),
+)
 """Types that are described with their class, for all their keys."""
 _AS_MAPPING = (Payload, TopicRate)
 """Types of items of lists that a table writes as one mapping."""

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from router.table.grammar.keys import REASON, TEXT, Schema, about, key, mapping, part, properties, ref, required
-from router.table.grammar.rules import ENDPOINT, GATEWAY, LIMIT, ROUTE, STATE, alone, without
+from router.table.grammar.rules import CALLS, ENDPOINT, GATEWAY, LIMIT, ROUTE, STATE, alone, without
 from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
 from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
 from router.table.model.serial import SerialLine
-from router.table.model.services import Service, ServiceReply, ServiceRequest
+from router.table.model.services import (
+    CalledReply,
+    CalledService,
+    Service,
+    ServiceCall,
+    ServiceReply,
+    ServiceRequest,
+    ServiceSource,
+)
 from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
@@ -206,7 +214,10 @@ PARTS: Schema = {
     "listener": _LISTENER,
     "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,
-    "service": part(Service),
+    "service": {"if": CALLS, "then": part(CalledService), "else": part(Service)},
+    "service_source": part(ServiceSource),
+    "service_call": part(ServiceCall),
+    "called_reply": part(CalledReply),
     "service_request": part(ServiceRequest),
     "service_reply": part(ServiceReply),
     "case": _CASE,

@@ -10,7 +10,15 @@ from router.table.grammar.keys import Schema, key, ref, required
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Transport, ZenohSettings
 from router.table.model.routes import Collect
-from router.table.model.services import Service, ServiceReply, ServiceRequest
+from router.table.model.services import (
+    CalledReply,
+    CalledService,
+    Service,
+    ServiceCall,
+    ServiceReply,
+    ServiceRequest,
+    ServiceSource,
+)
 from router.table.model.settings import RecordSettings
 from router.table.model.state import State
 
@@ -39,6 +47,9 @@ def _over(transport: str) -> Schema:
 def _each(schema: Schema) -> Schema:
     return {"additionalProperties": schema}
 
+
+CALLS: Schema = {"type": "object", "required": ["call"]}
+"""A service that an endpoint calls."""
 
 # -- required keys
 
@@ -97,10 +108,21 @@ COMPLETE: Schema = {
             ),
             "services": _each(
                 {
-                    "required": [*required(Service), "request", "reply"],
-                    "properties": {
-                        "request": {"required": required(ServiceRequest)},
-                        "reply": {"required": required(ServiceReply)},
+                    "if": CALLS,
+                    "then": {
+                        "required": ["from", "call", "reply", *required(CalledService)],
+                        "properties": {
+                            "from": {"required": required(ServiceSource)},
+                            "call": {"required": required(ServiceCall)},
+                            "reply": {"required": required(CalledReply)},
+                        },
+                    },
+                    "else": {
+                        "required": [*required(Service), "request", "reply"],
+                        "properties": {
+                            "request": {"required": required(ServiceRequest)},
+                            "reply": {"required": required(ServiceReply)},
+                        },
                     },
                 }
             ),

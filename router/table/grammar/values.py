@@ -112,6 +112,10 @@ VALUES: Schema = {
     "namespace": _text(
         f"^(?:/|(?:/{_NAME})+)$", "begin with '/' and have letters, digits and '_' between its slashes"
     ),
+    "service_name": _text(
+        f"^(?:~/|/)?{_NAME}(?:/{_NAME})*$",
+        "be the name of a ROS service: letters, digits and '_', with '/' between parts",
+    ),
     "locator": _text(r"^[a-z][a-z0-9_-]*/\S+$", "be a Zenoh locator, such as 'tcp/192.168.0.10:7447'"),
     "key_prefix": _text(
         f"^{_KEY_PART}(?:/{_KEY_PART})*$",

@@ -16,7 +16,7 @@ from router.errors import Located, SourceSpan
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway
 from router.table.model.routes import Route
-from router.table.model.services import Service
+from router.table.model.services import CalledService, Service
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
 
@@ -62,6 +62,7 @@ class RouteTable:
     networks: Networks | None = None
     states: Mapping[str, State] = field(default_factory=dict)
     services: Mapping[str, Service] = field(default_factory=dict)
+    called: Mapping[str, CalledService] = field(default_factory=dict)
     package: Located[str] | None = None
 
     @property

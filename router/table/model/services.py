@@ -1,4 +1,4 @@
-"""Services: ROS services that boards answer."""
+"""Services: ROS services that boards answer, and ROS services that boards call."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -98,4 +98,85 @@ class Service:
 
     Example: the arm does not move, it only changes its mode
     Error: must say why
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSource:
+    """Which message calls a ROS service: a payload `case` from an endpoint.
+
+    `span` is the key `from`.
+    """
+
+    span: SourceSpan
+    case: Located[str]
+    """The payload case that calls the service.
+
+    Title: Payload case
+    Example: home_request
+    """
+    source: Located[str]
+    """The endpoint that sends it, and gets the reply.
+
+    Example: nav_board
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceCall:
+    """Which ROS service is called, and how its request is filled. `span` is the key `call`, `timeout` is in ns."""
+
+    span: SourceSpan
+    service: Annotated[Located[str], Shape("service_name")]
+    """The name of the service in ROS, which is resolved in the node's namespace.
+
+    Example: get_home
+    """
+    type: Located[str]
+    """The ROS service type.
+
+    Example: std_srvs/srv/Trigger
+    """
+    timeout: Annotated[Located[int], DURATION]
+    """How long to wait for the server's response.
+
+    Example: 1s
+    """
+    fields: FieldMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CalledReply:
+    """What the endpoint gets: a payload `case`, filled with the fields of the service's response.
+
+    `request.NAME` is a field of the message that called: a number, a bool or an enum. `span` is the key `reply`.
+    """
+
+    span: SourceSpan
+    case: Located[str]
+    """The payload case of the reply.
+
+    Title: Payload case
+    Example: home_reply
+    """
+    fields: FieldMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CalledService:
+    """A ROS service that an endpoint calls: its message becomes the request, and the response a message to it.
+
+    `span` is its name in the table.
+    """
+
+    name: str
+    span: SourceSpan
+    source: Annotated[ServiceSource, Named("from")]
+    call: ServiceCall
+    reply: CalledReply
+    on_timeout: FieldMap
+    """The payload of the reply if there is no response: no server is there, or it does not respond in time, or the
+    router reloads its table or stops. 'request.NAME' is as in 'reply', and 'reason' a text that says which.
+
+    Example: {id: request.id, found: false}
     """
