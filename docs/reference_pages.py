@@ -24,7 +24,7 @@ class Section(NamedTuple):
 
 
 TABLE = (
-    Section("Envelope", "envelope", "properties.envelope"),
+    Section("Envelope", "envelope", "definitions.envelope"),
     Section("ROS node", "node", "properties.node"),
     Section("HTTP", "http", "properties.http"),
     Section("Recording", "record", "properties.record"),

@@ -19,7 +19,7 @@ from router.types.framing import restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, MessageClass, PayloadCase, find_envelope, load_protos
-from router.types.table_envelopes import Envelopes
+from router.types.table_envelopes import Envelopes, told_apart
 from router.types.wire import read_varint
 
 Peer = tuple[str, int]
@@ -118,12 +118,12 @@ def wire_of_table(table: RouteTable) -> Wire:
 
     def chosen(settings: EnvelopeSettings) -> Envelope:
         schema = load_protos(
-            settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+            settings.protos, settings.message, settings.lock_file, settings.exclude, with_others=settings.has_many
         )
         return chosen_envelope(schema, settings.choice)
 
     by_name = {name: chosen(settings) for name, settings in table.envelopes.items()}
-    return Wire(Envelopes(by_name, *table.envelope_names))
+    return Wire(Envelopes(told_apart(by_name), *table.envelope_names))
 
 
 def wire_of_protos(root: Path) -> Wire:

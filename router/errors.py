@@ -92,6 +92,7 @@ class Code(enum.Enum):
     UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that is not in the envelope.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
     UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that is not in `endpoints`.")
+    UNKNOWN_ENVELOPE = ("unknown-envelope", "The `envelope` of a listener or an endpoint that is not in `envelopes`.")
     UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` or `send_from` that is not in `listen`.")
     UNUSED_LISTENER = ("unused-listener", "A listener that accepts none of the sending endpoints.")
     ADDRESS_CLASH = (

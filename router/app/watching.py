@@ -104,7 +104,8 @@ def watched_files(table: RouteTable) -> list[Path]:
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
     protos = (path for envelope in table.envelopes.values() for path in walk(envelope.protos.value))
-    paths += [envelope.lock.value for envelope in table.envelopes.values() if envelope.lock is not None]
+    locks = [envelope.lock_file for envelope in table.envelopes.values()]
+    paths += [lock.value for lock in locks if lock is not None]
     return [*table.files, *paths, *protos]
 
 

@@ -22,7 +22,7 @@ from router.types.lock_file import ENVELOPE, ONEOF, short_name
 
 if TYPE_CHECKING:
     from router.table.model.settings import EnvelopeSettings
-    from router.types.lock import Conflict
+    from router.types.lock import Conflict, LockComparison
     from router.types.lock_file import Lock
 
 _DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add their new numbers to it. A number that is
@@ -51,24 +51,11 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the lock file. Raises TableError for broken `.proto` files or a broken lock file."""
-    from router.types.envelopes import chosen_envelope
-    from router.types.lock import LockComparison
-    from router.types.lock_file import read_lock, write_lock
-    from router.types.protobuf import load_protos, lock_path
+    """Write the lock file of each envelope. Raises TableError for broken `.proto` files or a broken lock file."""
+    from router.types.lock_file import write_lock
 
-    settings = _settings(args)
-    path = lock_path(settings.protos, settings.lock)
-    if is_installed(path):
-        what = f"{path} belongs to the installed router: the next upgrade overwrites it"
-        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name the copy: --protos protos")
-    settings = _with_names(settings, args, read_lock(path))
-    schema = load_protos(
-        settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
-    )
-    envelope = chosen_envelope(schema, settings.choice)
-    lock = LockComparison(envelope, None if args.protos else table_path(args))
-    conflicts = lock.conflicts
+    locks = [_compared(args, settings) for settings in _settings(args)]
+    conflicts = [conflict for lock in locks for conflict in lock.conflicts]
     accepted = _accepted(args.accept, conflicts)
     if refused := [conflict for conflict in conflicts if conflict not in accepted]:
         print_findings(sorted((conflict.finding for conflict in refused), key=lambda finding: finding.span), sys.stdout)
@@ -76,21 +63,45 @@ def run(args: argparse.Namespace) -> int:
             names = " ".join(f"--accept {conflict.name}" for conflict in conflicts)
             print(f"nothing was written; if all of these changes are intended, accept them together: {names}")
         return BAD_TABLE
-    new = lock.extended(accepted)
-    if new != lock.lock:
-        write_lock(path, new)
+    extended = [lock.extended([each for each in lock.conflicts if each in accepted]) for lock in locks]
+    for lock, new in zip(locks, extended, strict=True):
+        if new != lock.lock:
+            write_lock(lock.path, new)
     for conflict in accepted:
         print(f"accepted: {conflict.finding.message}")
-    print(f"{shown_path(path)}: {_summary(lock.lock, new, schema.unbounded(envelope.name))}")
+    for lock, new in zip(locks, extended, strict=True):
+        print(f"{shown_path(lock.path)}: {_summary(lock.lock, new, lock.unbounded)}")
     return OK
 
 
-def _settings(args: argparse.Namespace) -> EnvelopeSettings:
-    """Return the places of protos and lock. Raises TableError for a broken table."""
+def _compared(args: argparse.Namespace, settings: EnvelopeSettings) -> LockComparison:
+    """Return the differences between the protos of an envelope and its lock file."""
+    from router.types.envelopes import chosen_envelope
+    from router.types.lock import LockComparison
+    from router.types.lock_file import read_lock
+    from router.types.protobuf import load_protos, lock_path
+
+    path = lock_path(settings.protos, settings.lock_file)
+    if is_installed(path):
+        what = f"{path} belongs to the installed router: the next upgrade overwrites it"
+        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name the copy: --protos protos")
+    settings = _with_names(settings, args, read_lock(path))
+    schema = load_protos(
+        settings.protos, settings.message, settings.lock_file, settings.exclude, with_others=settings.has_many
+    )
+    return LockComparison(chosen_envelope(schema, settings.choice), None if args.protos else table_path(args))
+
+
+def _settings(args: argparse.Namespace) -> Sequence[EnvelopeSettings]:
+    """Return the places of protos and lock of each envelope. Raises TableError for a broken table."""
     if args.protos and args.table:
         raise UsageError("--protos and --table both say where the messages are", "give only one")
-    settings = _of_folder(args.protos) if args.protos else _of_table(table_path(args))
-    return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
+    found = [_of_folder(args.protos)] if args.protos else _of_table(table_path(args))
+    if len(found) > 1 and (args.lock or args.message or args.oneof):
+        raise UsageError("the table has several envelopes", "name the folder of one: --protos DIR")
+    if args.lock:
+        return [replace(each, lock=Located(args.lock.absolute(), each.protos.span)) for each in found]
+    return found
 
 
 def _of_folder(root: Path) -> EnvelopeSettings:
@@ -100,7 +111,8 @@ def _of_folder(root: Path) -> EnvelopeSettings:
     return EnvelopeSettings(Located(root.absolute(), span), Located("", span))
 
 
-def _of_table(path: Path) -> EnvelopeSettings:
+def _of_table(path: Path) -> Sequence[EnvelopeSettings]:
+    from router.compiler.envelopes import shared_lock_findings
     from router.table import load_table
 
     table, findings = load_table(path)
@@ -108,7 +120,9 @@ def _of_table(path: Path) -> EnvelopeSettings:
         raise TableError(findings)
     if not table.envelopes:
         raise UsageError(f"{path} has no 'envelope'", "name the folder of the protos: --protos protos")
-    return table.envelopes[""]
+    if shared := list(shared_lock_findings(table)):
+        raise TableError(shared)
+    return [*table.envelopes.values()]
 
 
 def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock | None) -> EnvelopeSettings:

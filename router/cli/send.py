@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from router.cli import Subparsers, add_verb, with_help
 from router.cli.completion import cases, completes, endpoints, fields, places
 from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, say, until_interrupted, whole
-from router.errors import UsageError
+from router.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from router.table.model import RouteTable
     from router.table.model.endpoints import Listener
     from router.tools.udp import Sent
+    from router.types.table_envelopes import Envelopes
 
 _EXAMPLES = (
     "router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000",
@@ -68,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
     exact = envelope_of(wire, [args.case, *args.fields])
     data = framed(exact, args.trim, args.pad)
     count = args.count if args.count is not None else None if args.rate else 1
+    if table is not None:
+        _require_case(wire.envelopes, table, args)
     if table is not None and (line := links.line_of(args.to, table)) is not None:
         return _send_frames(args, line, table, data, count)
     to = udp.destination(args.to, table)
@@ -80,6 +83,16 @@ def run(args: argparse.Namespace) -> int:
         send(sender, to, data, count, args.rate, sent)
     print(_summary(_cases(args), data, str(to), sent))
     return _advise(args, table, to, sent)
+
+
+def _require_case(envelopes: Envelopes, table: RouteTable, args: argparse.Namespace) -> None:
+    """Raise UsageError if a listener or an endpoint has another envelope than the payload case."""
+    is_named = args.to in table.endpoints or args.to in table.listeners
+    around = envelopes.to(args.to) if args.to in table.endpoints else envelopes.at(args.to)
+    if is_named and args.case not in around.cases:
+        held = around.holding(envelopes.cases[args.case])
+        hint = f"write {held[0].name}" if held else did_you_mean(args.case, around.cases)
+        raise UsageError(f"'{args.to}' takes {around.name}, which has no payload case '{args.case}'", hint)
 
 
 def _send_frames(args: argparse.Namespace, line: Listener, table: RouteTable, data: bytes, count: int | None) -> int:

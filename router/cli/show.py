@@ -57,15 +57,14 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     from router.datagrams import Wire
     from router.recording.reader import Recording
-    from router.recording.schemas import recorded_envelope
-    from router.types.table_envelopes import Envelopes
+    from router.recording.schemas import recorded_envelopes
 
     if args.why and (args.cases or args.where):
         raise UsageError("--why explains whole stops", "leave out --case and --where")
     if args.margin is not None and args.around is None:
         raise UsageError("--margin is for --around", "give both")
     with closing(Recording(args.file)) as recording:
-        wire = Wire(Envelopes({"": recorded_envelope(recording.cases())}))
+        wire = Wire(recorded_envelopes(recording.cases(), recording.about))
         entries = in_order(recording.everything())
         first = next(entries, None)
         if first is None:

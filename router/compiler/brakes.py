@@ -25,7 +25,7 @@ _LATCHED = ("transient_local", "best_available")
 def brake_findings(table: RouteTable, routes: Sequence[CheckedRoute]) -> Iterator[Diagnostic]:
     """Yield warnings for deadmen that no board may obey, and for commands that may be of any age."""
     boards = {name for name, endpoint in table.endpoints.items() if endpoint.kind is EndpointKind.BOARD}
-    taken = _taken(table, boards)
+    taken = _taken(table, routes, boards)
     for checked in routes:
         route = checked.route
         if f"routes/{route.case.value}" in table.broken:
@@ -40,13 +40,17 @@ def brake_findings(table: RouteTable, routes: Sequence[CheckedRoute]) -> Iterato
 # What boards take
 
 
-def _taken(table: RouteTable, boards: Collection[str]) -> Mapping[str, Sequence[str]]:
-    """Return the payload cases that routes send to each board."""
+def _taken(table: RouteTable, routes: Sequence[CheckedRoute], boards: Collection[str]) -> Mapping[str, Sequence[str]]:
+    """Return the payload cases that routes send to each board; of one with another envelope, under both names."""
     by_board: dict[str, dict[str, None]] = {name: {} for name in table.endpoints if name in boards}
     for route in table.routes:
         for destination in route.destinations:
             if destination.endpoint.value in by_board:
                 by_board[destination.endpoint.value][route.case.value] = None
+    rewrapped = ((target.label, target.rewrapped) for checked in routes for target in checked.all_targets)
+    for name, held in rewrapped:
+        if held is not None and name in by_board:
+            by_board[name][held.name] = None
     return {name: [*cases] for name, cases in by_board.items()}
 
 

@@ -17,6 +17,7 @@ from router.compiler.brakes import brake_findings
 from router.compiler.called import check_called
 from router.compiler.checked import CheckedCalled, CheckedRoute, CheckedService, CheckedState
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
+from router.compiler.envelopes import envelope_findings, shared_lock_findings
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
 from router.compiler.lowering import Lowered, lower_table
@@ -43,7 +44,7 @@ from router.types.envelopes import chosen_envelope
 from router.types.lock import LockComparison
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, no_envelope
-from router.types.table_envelopes import Envelopes
+from router.types.table_envelopes import Envelopes, told_apart, written_alike
 
 
 @contextmanager
@@ -128,9 +129,11 @@ def check_table(
     own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
-        *(warning for schema in envelopes.schemas for warning in schema.warnings),
+        *dict.fromkeys(warning for schema in envelopes.schemas for warning in schema.warnings),
         *(finding for name, lock in locks.items() for finding in lock.findings(table.envelopes[name].lock)),
         *network_findings(table),
+        *envelope_findings(table),
+        *shared_lock_findings(table),
         *_board_findings(table, boards),
         *_envelope_findings(lookup, routes),
         *_unused_sets(lookup, routes),
@@ -172,7 +175,7 @@ def _boards(table: RouteTable, envelopes: Envelopes, locks: Mapping[str, LockCom
     """Return the limits of each board by name."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
     of_envelope = {
-        name: _limits(table, envelopes.by_name[name], lock)
+        name: _limits(table, envelopes, envelopes.by_name[name], lock)
         for name, lock in locks.items()
         if any(envelopes.endpoints[board.name] == name for board in boards)
     }
@@ -183,15 +186,16 @@ def _boards(table: RouteTable, envelopes: Envelopes, locks: Mapping[str, LockCom
     }
 
 
-def _limits(table: RouteTable, envelope: Envelope, lock: LockComparison) -> BoardLimits:
-    """Return the limits of boards that get this envelope and allow finite numbers only."""
+def _limits(table: RouteTable, envelopes: Envelopes, envelope: Envelope, lock: LockComparison) -> BoardLimits:
+    """Return the limits of boards that get this one of the envelopes and allow finite numbers only."""
     schema = envelope.schema
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options, envelope.choice.root)
     named = {route.case.value for route in table.routes}
     named |= {service.request.case.value for service in table.services.values()}
     named |= {service.reply.case.value for service in table.called.values()}
     named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
-    cases = [case for name, case in envelope.cases.items() if name in named]
+    types = {case.type.name for table_case in named if (case := envelopes.cases.get(table_case)) is not None}
+    cases = [case for case in envelope.cases.values() if case.type.name in types]
     longest, payloads = lock.max_size or envelope.max_size, payload_fields(envelope, cases, schema.board_options)
     return BoardLimits(fields, longest, allows_non_finite=False, payloads=payloads)
 
@@ -250,6 +254,7 @@ def _unused_sets(lookup: Lookup, routes: Sequence[CheckedRoute]) -> Iterator[Dia
 
 def _made_for(checked: CheckedRoute) -> Iterator[str]:
     """Yield the endpoints to which a route sends envelopes that the router makes."""
+    yield from (target.label for target in checked.targets if target.rewrapped)
     yield from (target.label for subscription in checked.subscriptions for target in subscription.targets)
     yield from (name for name, _ in (checked.deadman.datagrams if checked.deadman else ()))
 
@@ -260,4 +265,8 @@ def _envelopes(table: RouteTable, definitions: Definitions) -> Envelopes:
         name: chosen_envelope(definitions.protos(settings), settings.choice)
         for name, settings in table.envelopes.items()
     }
-    return Envelopes(chosen or {"": no_envelope()}, *table.envelope_names)
+    if alike := written_alike(chosen):
+        label, name = alike
+        message, hint = f"two payload cases would be written '{name}'", f"give '{label}' another name"
+        raise TableError.of(table.envelopes[label].message.span, Code.BAD_VALUE, message, hint)
+    return Envelopes(told_apart(chosen) or {"": no_envelope()}, *table.envelope_names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,9 +30,10 @@ class Target:
     """A target of a route, as the table declares it, with the results of its check, and then its routines.
 
     `endpoint` is set for a destination, `type` for a published topic, `for_each` for one that gets each element of a
-    list. Without a `plan`, the datagram is forwarded unchanged; `rows` describe the mapping for `explain`. `deadmen`
-    are the routes whose deadmen each command to this target feeds (its own route's) or disarms. `beside` is what `set`
-    of the endpoint fills in messages with a plan. `is_request`: its messages are requests of a service, and never wait.
+    list. Without a `plan`, the datagram is forwarded: unchanged, or with its payload in another envelope, as the
+    payload case `rewrapped`. `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each
+    command to this target feeds (its own route's) or disarms. `beside` is what `set` of the endpoint fills in messages
+    that the router makes. `is_request`: its messages are requests of a service, and never wait.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
     without a `when`, or without a `plan`. `gate` is the part of the condition that reads only states, if messages may
@@ -47,6 +48,7 @@ class Target:
     type: MessageType | None = None
     when: Node | None = None
     plan: Record | None = None
+    rewrapped: PayloadCase | None = None
     rows: tuple[Row, ...] = ()
     declared_priority: Priority | None = None
     deadmen: tuple[str, ...] = ()
@@ -200,6 +202,12 @@ class CheckedRoute:
     order: CheckedOrder | None = None
     collect: CheckedCollect | None = None
     deadman: DeadmanPlan | None = None
+
+    @property
+    def all_targets(self) -> Iterator[Target]:
+        yield from self.targets
+        for feed in self.subscriptions:
+            yield from feed.targets
 
     @property
     def obeyed(self) -> ObeyedPlan | None:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 
@@ -49,8 +49,8 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
         message = f"a deadman sends to at most {MOST_DESTINATIONS} endpoints, not {len(deadman.to)}"
         lookup.report(deadman.to[0].span, Code.BAD_VALUE, message, "divide them among several routes")
         return None
-    sent = [_datagram(lookup, deadman, payload) for payload in deadman.payloads]
-    datagrams = [datagram for datagram in sent if datagram is not None]
+    sent = [_datagrams(lookup, deadman, payload) for payload in deadman.payloads]
+    datagrams = [by_name for by_name in sent if by_name is not None]
     if len(datagrams) < len(sent):
         return None
     commanded = {destination.endpoint.value for destination in route.destinations}
@@ -61,7 +61,7 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
     by_endpoint = []
     for to in deadman.to:
         before = beside[to.value].data if to.value in beside else b""
-        whole = (before + data for data in datagrams)
+        whole = (before + by_name[to.value] for by_name in datagrams if to.value in by_name)
         by_endpoint.append((to.value, tuple(trimmed(data) if to.value in trims else data for data in whole)))
     sources = *(source.value for source in route.sources), *(topic.topic.value for topic in route.source_topics)
     watched = frozenset((source, route.case.value) for source in sources)
@@ -166,36 +166,36 @@ def _report_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> boo
     return False
 
 
-def _datagram(lookup: Lookup, deadman: Deadman, payload: Payload) -> bytes | None:
-    """Return a payload of the deadman as an envelope; None with a finding."""
+def _datagrams(lookup: Lookup, deadman: Deadman, payload: Payload) -> Mapping[str, bytes] | None:
+    """Return a payload of the deadman in the envelope of each endpoint, by its name; None with a finding."""
     case = lookup.case(payload.case)
     if case is None:
         return None
     known = len(lookup.findings)
-    for name in deadman.to:
-        lookup.recipient(case, name, sources=frozenset())
+    recipients = [found for name in deadman.to if (found := lookup.recipient(case, name, sources=frozenset()))]
     can_reach = len(lookup.findings) == known
     plan = constant_plan(lookup, payload.fields, case.type, payload.case.span)
     if plan is None:
         return None
+    held_as = {each.case.name: each.case for each in recipients}
     try:
-        datagram = envelope_of(plan, case)
+        made = {name: envelope_of(plan, held) for name, held in held_as.items()}
     except FindingError as error:
         lookup.findings.append(error.diagnostic)
         return None
-    return None if can_reach and _is_refused(lookup, deadman, payload, datagram) else datagram
+    datagrams = {each.endpoint.name: made[each.case.name] for each in recipients}
+    return None if can_reach and _is_refused(lookup, payload, datagrams) else datagrams
 
 
-def _is_refused(lookup: Lookup, deadman: Deadman, payload: Payload, datagram: bytes) -> bool:
+def _is_refused(lookup: Lookup, payload: Payload, datagrams: Mapping[str, bytes]) -> bool:
     """Report the first board that cannot decode the envelope of a payload. Return whether there is one.
 
     The size was checked with the payload case.
     """
-    around = lookup.envelopes.of(payload.case.value)
-    envelope = around.message_class.FromString(datagram)
-    payloads = around.payloads_of(envelope)
-    for name in (to.value for to in deadman.to if to.value in lookup.boards):
-        board = lookup.boards[name]
+    for name in (name for name in datagrams if name in lookup.boards):
+        board, around = lookup.boards[name], lookup.envelopes.to(name)
+        envelope = around.message_class.FromString(datagrams[name])
+        payloads = around.payloads_of(envelope)
         held = [(message, board.payload(case)) for case, message in payloads if case.number in board.payloads]
         for field, value in chain(*(scalars(*each) for each in [(envelope, board.fields), *held])):
             if misfit := board.misfit(field, value):

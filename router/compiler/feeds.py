@@ -61,7 +61,7 @@ def successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...
         if name.value in broken or any(name.value.startswith(f"{case}_from_") for case in broken):
             continue
         if name.value not in lookup.envelopes.cases and name.value not in lookup.routes:
-            message = f"'{name.value}' is neither a payload case of {lookup.envelopes.first.name} nor a route"
+            message = f"'{name.value}' is neither a payload case of {lookup.envelopes.title} nor a route"
             hint = did_you_mean(name.value, _commanding(lookup, route, deadman) or lookup.envelopes.cases)
             lookup.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
         elif name.value not in served and are_known:

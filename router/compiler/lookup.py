@@ -8,6 +8,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 from router import inputs
 from router.compiler.compiled_table import Beside
@@ -45,17 +46,17 @@ class Definitions:
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Return the protos of an envelope. Raises TableError; an invalid folder is read again for each table."""
         exclude = tuple(entry.value for entry in settings.exclude)
-        lock = lock_path(settings.protos, settings.lock)
+        lock = lock_path(settings.protos, settings.lock_file)
         key = settings.protos.value, settings.message.value, lock, exclude, settings.has_many
         if key not in self._protos:
             known = self._unchanged(settings)
             self._protos[key] = known or load_protos(
-                settings.protos, settings.message, settings.lock, settings.exclude, with_others=settings.has_many
+                settings.protos, settings.message, settings.lock_file, settings.exclude, with_others=settings.has_many
             )
         return self._protos[key]
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
-        root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock)
+        root, lock = Path(inputs.real_path(settings.protos.value)), lock_path(settings.protos, settings.lock_file)
         exclude = [entry.value for entry in settings.exclude]
         wanted = root, lock, exclude, settings.has_many
         for known in self._known:
@@ -72,6 +73,13 @@ class Definitions:
 _ALIKE = 0.8
 """Similarity required to suggest another endpoint. It is high, because commands go there."""
 NO_NAMES: Mapping[str, Node] = {}
+
+
+class Recipient(NamedTuple):
+    """An endpoint, and the payload case as which it gets a payload: with several envelopes, one of its own envelope."""
+
+    endpoint: Endpoint
+    case: PayloadCase
 
 
 @dataclass
@@ -129,17 +137,45 @@ class Lookup:
             self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return endpoint
 
-    def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
-        """Return the endpoint `name`, a recipient of payloads of `case` from `sources`; None if it does not exist."""
+    def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Recipient | None:
+        """Return the endpoint `name`, a recipient of payloads of `case` from `sources`; None with a finding."""
         endpoint = self.endpoint(name)
-        if endpoint is None:
+        if endpoint is None or (held := self._held(case, endpoint, name.span)) is None:
             return None
         finding = loop_finding(self.table, endpoint, name.span, case.name, sources)
         if finding and finding.message not in {earlier.message for earlier in self.findings}:
             self.findings.append(finding)  # an endpoint that is the router itself is reported once, not per route
         if (limits := self.boards.get(endpoint.name)) is not None:
-            self.findings += board_findings(case, self.envelopes.of(case.name).schema, limits.longest, name.span)
-        return endpoint
+            self.findings += board_findings(held, self.envelopes.of(held.name).schema, limits.longest, name.span)
+        return Recipient(endpoint, held)
+
+    def _held(self, case: PayloadCase, endpoint: Endpoint, span: SourceSpan) -> PayloadCase | None:
+        """Return the payload case as which an endpoint gets payloads of `case`; None with a finding."""
+        if self.envelopes.endpoints[endpoint.name] not in self.envelopes.by_name:
+            return case  # its envelope has a finding already
+        found, around = self.envelopes.held(case, endpoint.name), self.envelopes.to(endpoint.name)
+        if len(found) == 1:
+            return found[0]
+        several = f"several payload cases of type {case.type.name}: {', '.join(each.name for each in found)}"
+        what = several if found else f"no payload case of type {case.type.name}"
+        hint = "publish the message on a topic, and write a route from that topic to the endpoint"
+        self.report(span, Code.BAD_VALUE, f"'{endpoint.name}' gets {around.name}, which has {what}", hint)
+        return None
+
+    def require_listener(self, case: PayloadCase, source: Located[str]) -> None:
+        """Report a source whose datagrams arrive only at listeners that receive other envelopes."""
+        envelopes, endpoint = self.envelopes, self.table.endpoints.get(source.value)
+        names = [endpoint.listener.value] if endpoint and endpoint.listener else [*self.table.listeners]
+        wanted = {envelopes.of(case.name).label}
+        received = {envelopes.listeners[name] for name in names if name in envelopes.listeners}
+        if not received or received & wanted or not received <= envelopes.by_name.keys():
+            return
+        others = " and ".join(f"'{name}'" for name in sorted(received))
+        places = f"listener '{names[0]}'" if len(names) == 1 else "the listeners"
+        verb = "receives" if len(names) == 1 else "receive"
+        message = f"'{case.name}' cannot arrive from '{source.value}': {places} {verb} only {others}"
+        hint = f"add a listener with `envelope: {envelopes.of(case.name).label}`"
+        self.report(source.span, Code.BAD_VALUE, message, hint)
 
     def ros_type(self, topic: Topic) -> MessageType | None:
         """Return the message type of a topic, or None with a finding; without a finding if the topic has no `type`."""

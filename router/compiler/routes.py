@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from router.compiler.checked import CheckedCollect, CheckedOrder, CheckedRoute, CheckedSubscription, Target
@@ -12,7 +12,7 @@ from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKin
 from router.compiler.expressions.lists import as_value
 from router.compiler.expressions.tree import COUNT, ENVELOPE, INDEX, ITEM, ITEMS, Node, Read, Variable, constant_of
 from router.compiler.feeds import deadmen_of
-from router.compiler.lookup import NO_NAMES, Lookup
+from router.compiler.lookup import NO_NAMES, Lookup, Recipient
 from router.compiler.mapping import build
 from router.compiler.obeyed import check_obeyed
 from router.compiler.states import sets_state
@@ -20,12 +20,13 @@ from router.compiler.topics import qos_findings, resolved, stamp_of, topic_name_
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.keys import are_same
 from router.table.model import RouteTable
-from router.table.model.endpoints import Endpoint
 from router.table.model.expressions import Expression
 from router.table.model.routes import ANY, Collect, Route
 from router.table.model.targets import Destination, Topic
 from router.types.model import List, MessageType
 from router.types.protobuf import PayloadCase
+
+Destinations = Sequence[tuple[Destination, "Recipient | None"]]
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
 """Findings that are suppressed for a route with an invalid part, which was left out and has a finding."""
@@ -33,11 +34,12 @@ _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Co
 
 def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
     """Check the routes of the table. Return those whose payload case exists; findings go to `lookup`."""
-    _coverage(lookup)
-    return tuple(checked for route in lookup.table.routes if (checked := _checked(lookup, route)))
+    routes = tuple(checked for route in lookup.table.routes if (checked := _checked(lookup, route)))
+    _coverage(lookup, {target.rewrapped.name for route in routes for target in route.all_targets if target.rewrapped})
+    return routes
 
 
-def _coverage(lookup: Lookup) -> None:
+def _coverage(lookup: Lookup, rewrapped: Collection[str]) -> None:
     table, cases, unroutable = lookup.table, lookup.envelopes.cases, lookup.envelopes.unroutable
     names = [route.case.value for route in table.routes]
     names += [each.case.value for service in table.services.values() for each in (service.request, service.reply)]
@@ -45,6 +47,7 @@ def _coverage(lookup: Lookup) -> None:
     # a misspelt case is one finding, not two
     covered = {name if name in cases else nearest(name, cases) for name in names if name not in unroutable}
     covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
+    covered |= {*rewrapped}
     missing = [name for name in cases if name not in covered and name not in lookup.envelopes.parts]
     if any(name.startswith("services/") for name in table.broken):
         return  # it may cover them
@@ -99,7 +102,7 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         return None
     if route.ignore is not None:
         return CheckedRoute(route, case)
-    _sources(lookup, route)
+    _sources(lookup, route, case)
     is_setter = any(True for _ in sets_state(lookup.table.states.values(), route))
     if not route.destinations and not route.topics and not is_setter:
         places = "destinations" if route.is_outbound else "destinations or topics"
@@ -113,15 +116,15 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
     return replace(checked, deadman=replace(deadman, obeyed=obeyed) if deadman else None)
 
 
-def _sources(lookup: Lookup, route: Route) -> None:
+def _sources(lookup: Lookup, route: Route, case: PayloadCase) -> None:
     seen: set[str] = set()
     for source in route.sources:
         if source.value in seen:
             lookup.report(source.span, Code.BAD_VALUE, f"'{source.value}' is a source twice", "name it once")
         seen.add(source.value)
-        if source.value != ANY:
-            lookup.endpoint(source, (ANY,))
-        elif len(route.sources) > 1:
+        if source.value == ANY or lookup.endpoint(source, (ANY,)) is not None:
+            lookup.require_listener(case, source)
+        if source.value == ANY and len(route.sources) > 1:
             message, hint = f"'{ANY}' excludes other sources", f"write either '{ANY}' or the names of endpoints"
             lookup.report(source.span, Code.BAD_VALUE, message, hint)
     if route.sources and route.source_topics:
@@ -129,8 +132,8 @@ def _sources(lookup: Lookup, route: Route) -> None:
         lookup.report(route.source_topics[0].span, Code.BAD_VALUE, message, "write a list of two routes")
 
 
-def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
-    """Return the destinations of a route, each with its endpoint, or None with a finding if that does not exist."""
+def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> Destinations:
+    """Return the destinations of a route, each with what gets its payloads, or None with a finding."""
     sources = {source.value for source in route.sources}
     seen: set[str] = set()
     for destination in route.destinations:
@@ -142,12 +145,14 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
 
 
 def _destination(
-    lookup: Lookup, route: Route, destination: Destination, endpoint: Endpoint | None, scope: Scope
+    lookup: Lookup, checked: CheckedRoute, destination: Destination, recipient: Recipient | None, scope: Scope
 ) -> Target:
     """Check a destination. Return it without its plan."""
+    route = checked.route
     return Target(
         destination,
-        endpoint=endpoint,
+        endpoint=recipient.endpoint if recipient else None,
+        rewrapped=recipient.case if recipient and recipient.case is not checked.case else None,
         when=lookup.when(destination.when, scope),
         declared_priority=route.priority,
         deadmen=deadmen_of(lookup, route, destination),
@@ -159,7 +164,8 @@ def _destination(
 
 def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
     """Check destinations, topics and `collect` of a route from UDP."""
-    targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
+    made = CheckedRoute(route, case)
+    targets = [_forward(lookup, made, to, recipient) for to, recipient in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for index, topic in enumerate(route.topics):
         name = topic.topic.value
@@ -171,16 +177,16 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
             targets.append(published)
     order = _order(lookup, case, route.order) if route.order else None
     collect = _collect(lookup, route, case, route.collect) if route.collect else None
-    return CheckedRoute(route, case, tuple(targets), order=order, collect=collect)
+    return replace(made, targets=tuple(targets), order=order, collect=collect)
 
 
-def _forward(
-    lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
-) -> Target:
+def _forward(lookup: Lookup, checked: CheckedRoute, destination: Destination, recipient: Recipient | None) -> Target:
     if destination.fields is not None:
         message, hint = "datagrams are forwarded unchanged", "use 'fields' only for messages from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
-    return _destination(lookup, route, destination, endpoint, lookup.received(case, route=route))
+    scope = lookup.received(checked.case, route=checked.route)
+    target = _destination(lookup, checked, destination, recipient, scope)
+    return replace(target, beside=lookup.beside.get(target.label)) if target.rewrapped else target
 
 
 def _publish(
@@ -258,27 +264,23 @@ def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) 
 # from ROS
 
 
-Destinations = Sequence[tuple[Destination, "Endpoint | None"]]
-
-
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
     """Check the topics of a route from ROS, and their mappings to each destination."""
     recipients = destinations(lookup, route, case)
-    subscriptions = []
+    made, subscriptions = CheckedRoute(route, case), []
     for topic in route.source_topics:
         name = topic.topic.value
         if next(other for other in route.source_topics if other.topic.value == name) is not topic:
             lookup.report(topic.topic.span, Code.BAD_VALUE, f"topic '{name}' is listed twice", "name it once")
         ros_type = lookup.ros_type(topic)
-        if ros_type is not None and (checked := subscription(lookup, route, case, topic, ros_type, recipients)):
+        if ros_type is not None and (checked := subscription(lookup, made, topic, ros_type, recipients)):
             subscriptions.append(checked)
-    return CheckedRoute(route, case, subscriptions=tuple(subscriptions))
+    return replace(made, subscriptions=tuple(subscriptions))
 
 
 def subscription(
     lookup: Lookup,
-    route: Route,
-    case: PayloadCase,
+    checked: CheckedRoute,
     topic: Topic,
     ros_type: MessageType,
     recipients: Destinations,
@@ -289,7 +291,7 @@ def subscription(
 
     Of a service, `numbered` is the request with what the router adds to it, and `names` are further variables.
     """
-    message = numbered or ros_type
+    route, case, message = checked.route, checked.case, numbered or ros_type
     scope = lookup.scope(message, ros_type, names)
     stamp = stamp_of(scope, topic.span) if route.ttl else None
     for_each = None
@@ -304,13 +306,13 @@ def subscription(
     when = lookup.when(topic.when, scope)
     own = any(destination.fields for destination, _ in recipients)  # then the route needs no fields of its own
     targets = []
-    for destination, endpoint in recipients:
+    for destination, recipient in recipients:
         fields = destination.fields or route.fields
         whole = scope.variable(ITEM, route.span) if for_each else None
         span = destination.span if own else route.span
         mapping = build(fields, case.type, scope, span, whole, _element_type(for_each) if for_each else ros_type)
         lookup.findings += mapping.findings
-        target = _destination(lookup, route, destination, endpoint, scope)
+        target = _destination(lookup, checked, destination, recipient, scope)
         beside = lookup.beside.get(target.label)
         targets.append(replace(target, plan=mapping.plan, rows=tuple(mapping.rows), beside=beside))
     return CheckedSubscription(topic, message, when, for_each, stamp, tuple(targets))

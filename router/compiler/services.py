@@ -60,6 +60,7 @@ def _checked(lookup: Lookup, declared: Service) -> tuple[CheckedService, Target]
     endpoints = [lookup.endpoint(name) for name in filter(None, (declared.request.to, declared.reply.sender))]
     if request_case is None or reply_case is None or None in endpoints:
         return None
+    lookup.require_listener(reply_case, declared.reply.sender or declared.request.to)
     halves = service_type(lookup, declared.type)
     if halves is None:
         return None
@@ -127,7 +128,7 @@ def feeds(
     """Check the messages that a service sends to its endpoint. They feed no deadman, and never wait."""
     before, (topic,) = len(lookup.findings), route.source_topics
     recipients = destinations(lookup, route, case)
-    feed = subscription(lookup, route, case, topic, message, recipients, numbered, names)
+    feed = subscription(lookup, CheckedRoute(route, case), topic, message, recipients, numbered, names)
     if not message.fields:  # then nothing can fill the payload
         lookup.findings[before:] = [each for each in lookup.findings[before:] if each.code is not Code.NOTHING_MAPPED]
     if feed is None:

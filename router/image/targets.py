@@ -19,7 +19,6 @@ from router.declared import MOST_STATE_TEXT
 from router.image.boards import Boards
 from router.image.openings import Openings, period
 from router.table.model.targets import OnLimit, TargetKeys
-from router.types.protobuf import PayloadCase
 
 Sources = Mapping[int, "str | None"]
 """The sources of a route, by `source_of` in native/deliver.h; None stands for all publishers of a topic."""
@@ -162,7 +161,7 @@ class TargetWriter:
 
     def _target(self, plan: RoutePlan, target: Target, routines: Routines | None) -> c.Target:
         counters, place = self.program.counters, (plan.route, target.label)
-        written = self._topic(target.label) if target.is_topic else self._destination(target.label, plan.case)
+        written = self._topic(target.label) if target.is_topic else self._destination(plan, target)
         if routines is not None:
             routine = routines.routine
             written.condition, written.message, written.gate = map(
@@ -183,7 +182,8 @@ class TargetWriter:
         written.period, written.priority = _held_period(target.declared), c.Priority[target.priority.name]
         return written
 
-    def _destination(self, endpoint: str, case: PayloadCase | None) -> c.Target:
+    def _destination(self, plan: RoutePlan, target: Target) -> c.Target:
+        endpoint, case = target.label, target.rewrapped or plan.case
         written = c.Target(
             sender=self.openings.sender(endpoint), trims=self.program.table.endpoints[endpoint].trim_trailing_zeros
         )

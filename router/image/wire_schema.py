@@ -10,9 +10,8 @@ from router import declared as c
 from router.compiler.lowering.arrays import Arrays
 from router.declared import CaseBy, WireFlag, WireKind
 from router.types.case_by import ByCases, ByName, ByOneof
-from router.types.descriptors import message_of
+from router.types.descriptors import all_fields, all_types, message_of
 from router.types.protobuf import Envelope, MessageClass, PayloadCase
-from router.types.undecidable import all_fields, all_types
 from router.types.wire import I32, I64, VARINT, delimited, encoding_of, parses, validates_text
 
 

@@ -39,6 +39,8 @@ def about(table: RouteTable, reason: str, tripped: Sequence[str] = ()) -> dict[s
         if route.ignore is None
     }
     metadata = {"reason": reason, "table": table.path.name, "routes": json.dumps(routes)}
+    if len(table.envelopes) > 1:
+        metadata["envelopes"] = json.dumps(table.envelope_names)
     return {**metadata, "tripped": json.dumps(tripped)} if tripped else metadata
 
 
@@ -46,6 +48,12 @@ def routes_of(metadata: Mapping[str, str]) -> dict[str, RecordedRoute]:
     """Return the routes in the metadata, which old recordings do not have."""
     routes: dict[str, dict[str, Any]] = json.loads(metadata.get("routes", "{}"))
     return {name: RecordedRoute(**values) for name, values in routes.items()}
+
+
+def envelopes_of(metadata: Mapping[str, str]) -> Sequence[Mapping[str, str]]:
+    """Return the names of the envelopes of listeners and of endpoints, empty for a table with one."""
+    names: Sequence[Mapping[str, str]] = json.loads(metadata.get("envelopes", "[{}, {}]"))
+    return names
 
 
 def tripped_in(metadata: Mapping[str, str]) -> list[str]:

@@ -108,7 +108,8 @@ def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
     around = case.wrapping
     named = {"before": around.before.hex(), "after": around.after.hex()} if around.before or around.after else {}
     shared = {"shared": "1"} if around.is_shared else {}
-    return {"holds": holds.value, "number": str(around.tag >> 3), **named, **shared}
+    of = {"envelope": case.envelope} if case.envelope else {}
+    return {"holds": holds.value, "number": str(around.tag >> 3), **named, **shared, **of}
 
 
 def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:

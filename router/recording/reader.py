@@ -146,7 +146,10 @@ class Recording:
                     elif isinstance(record, Channel) and "number" in record.metadata:
                         case, schema = record.topic.rpartition("/")[2], schemas[record.schema_id]
                         around = wrapping_of(record.metadata)
-                        cases.setdefault((case, around), RecordedCase(case, around, schema.name, schema.data))
+                        cases.setdefault(
+                            (case, around),
+                            RecordedCase(case, around, schema.name, schema.data, record.metadata.get("envelope", "")),
+                        )
             except _DAMAGED:
                 pass
         return [*cases.values()]

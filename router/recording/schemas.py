@@ -10,9 +10,11 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from router.declared import ONLY_CASE
+from router.recording.about import envelopes_of
 from router.types.case_by import ByCases, ByFrame, ByName, ByOneof, Choice, Wrapping
 from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types, no_protos
+from router.types.table_envelopes import Envelopes
 from router.types.wire import LEN, read_varint
 
 _FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "payload"
@@ -24,13 +26,15 @@ _OPTIONAL = FieldDescriptorProto.LABEL_OPTIONAL
 class RecordedCase(NamedTuple):
     """A payload case, and how its envelope holds it.
 
-    `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares.
+    `message` is the full name of its type, which `schema`, a FileDescriptorSet, declares. `envelope` is the name of its
+    envelope in a table with several.
     """
 
     name: str
     around: Wrapping
     message: str
     schema: bytes
+    envelope: str = ""
 
 
 def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
@@ -38,6 +42,16 @@ def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
     number = int(metadata["number"])
     before, after = (bytes.fromhex(metadata.get(key, "")) for key in ("before", "after"))
     return Wrapping(number << 3 | LEN if number else 0, before, after, is_shared="shared" in metadata)
+
+
+def recorded_envelopes(cases: Iterable[RecordedCase], about: Mapping[str, str]) -> Envelopes:
+    """Return the envelopes of a recording, from its payload cases and its metadata."""
+    names = envelopes_of(about)
+    of_envelope: dict[str, list[RecordedCase]] = {name: [] for known in names for name in known.values()}
+    for case in cases:
+        of_envelope.setdefault(case.envelope, []).append(case)
+    by_name = {name: recorded_envelope(several) for name, several in of_envelope.items()}
+    return Envelopes(by_name or {"": recorded_envelope(())}, *names)
 
 
 def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
@@ -52,7 +66,8 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
 
     def made(case: RecordedCase, number: int) -> PayloadCase:
         message_class = GetMessageClass(pool.FindMessageTypeByName(case.message))
-        return PayloadCase(case.name, number, types[case.message], message_class, None, case.around)
+        kind = types[case.message]
+        return PayloadCase(case.name, number, kind, message_class, None, case.around, case.envelope)
 
     own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
     message = own.message_type.add(name="Recorded")
@@ -75,7 +90,8 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
     pool.AddSerializedFile(own.SerializeToString())
     by_name = {case.name: case for case in payload_cases}
     message_class = GetMessageClass(pool.FindMessageTypeByName(_NAME))
-    return Envelope(_NAME, no_protos(), choice, message_class, by_name, 0)
+    label = next((case.envelope for case in payload_cases), "")
+    return Envelope(_NAME, no_protos(), choice, message_class, by_name, 0, label=label)
 
 
 def _add_fields(message: DescriptorProto, cases: Sequence[PayloadCase], *, is_shared: bool) -> Choice:
@@ -84,14 +100,14 @@ def _add_fields(message: DescriptorProto, cases: Sequence[PayloadCase], *, is_sh
         message.oneof_decl.add(name=_ONEOF)
     for each in cases:
         message.field.add(
-            name=each.name,
+            name=each.member,
             number=each.number,
             type=FieldDescriptorProto.TYPE_MESSAGE,
             label=_OPTIONAL,
             type_name=f".{each.type.name}",
             oneof_index=None if is_shared else 0,
         )
-    return ByCases([each.name for each in cases]) if is_shared else ByOneof(_ONEOF)
+    return ByCases([each.member for each in cases]) if is_shared else ByOneof(_ONEOF)
 
 
 def _name_of(around: Wrapping) -> tuple[int, str]:

@@ -176,17 +176,25 @@ class Names:
                 span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)
             ) from error
 
-    def listener(self, named: Located[str] | None, sender: str, span: SourceSpan) -> str:
-        """Return the listener that is named, else the one at which the sender is accepted, else the only one."""
+    def listener(
+        self, named: Located[str] | None, sender: str, payloads: Sequence[tuple[PayloadCase, Fields]], span: SourceSpan
+    ) -> str:
+        """Return the listener that is named, else the one at which the sender is accepted, else the only one.
+
+        The only one is among those that receive the envelope of the payloads.
+        """
         listeners = self._table.listeners
         if named is not None:
             return self._known(named.value, listeners, named.span, "listener")
         endpoint = self._table.endpoints.get(sender)
         if endpoint is not None and endpoint.listener is not None:
             return endpoint.listener.value
-        if len(listeners) > 1:
-            raise InvalidValueError(span, Code.MISSING_KEY, f"name the listener: {', '.join(listeners)}")
-        return next(iter(listeners))
+        envelopes = self._program.envelopes
+        around = [envelopes.of(case.name) for case, _ in payloads]
+        fitting = [name for name in listeners if not around or envelopes.at(name) is around[0]]
+        if len(fitting) != 1:
+            raise InvalidValueError(span, Code.MISSING_KEY, f"name the listener: {', '.join(fitting or listeners)}")
+        return fitting[0]
 
     def endpoint(self, name: str, span: SourceSpan) -> str:
         """Return an endpoint that something is sent to."""
@@ -277,7 +285,7 @@ class GivenReader:
         return Given(
             span=span,
             peer=self._names.peer(sender.value, sender.span),
-            listener=self._names.listener(optional_text(node, "listener"), sender.value, span),
+            listener=self._names.listener(optional_text(node, "listener"), sender.value, payloads, span),
             payloads=payloads,
             beside=self._content(self._names.beside(payloads[0][0]), node.get("envelope"), span) if payloads else None,
             data=data,

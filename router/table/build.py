@@ -96,11 +96,12 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     """
     builder = _Builder(findings)
     envelope = builder.one(root, "envelope", _envelope)
+    envelopes = {"": envelope} if envelope else builder.each(root, "envelopes", _named_envelope)
     routes = root.entries.get("routes")
     endpoints = root.entries.get("endpoints")
     if not all(entry is None or isinstance(entry.value, MappingNode) for entry in (routes, endpoints)):
         return None
-    if (envelope is None or routes is None) and not _has_gateways_only(root):
+    if (not envelopes or routes is None) and not _has_gateways_only(root):
         return None
     listeners = builder.each(root, "listen", _listener)
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
@@ -112,7 +113,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         path=sources[0].path,
         files=tuple(source.path for source in sources),
         sha256=sha256(b"".join(source.data for source in sources)).hexdigest(),
-        envelopes={"": envelope} if envelope else {},
+        envelopes=envelopes,
         node=builder.one(root, "node", _node) or NodeSettings(),
         package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
         http=builder.one(root, "http", _server),
@@ -248,7 +249,9 @@ def _listener(entry: Entry) -> Listener:
     if line.framing.kind == "hdlc" and line.checksum is not None:
         where = settings.entries["checksum"].key.span
         raise InvalidValueError(where, Code.BAD_VALUE, "HDLC frames have a CRC-32 of their own", "remove 'checksum'")
-    return Listener(name, span, Located(SerialPlace(line.serial.value, 0), line.serial.span), Framing.EXACT, line=line)
+    address: Address = SerialPlace(line.serial.value, 0)
+    device = Located(address, line.serial.span)
+    return Listener(name, span, device, Framing.EXACT, line=line, envelope=line.envelope)
 
 
 def _endpoint(entry: Entry, listeners: Mapping[str, Listener]) -> Endpoint:
@@ -303,7 +306,11 @@ def _service(entry: Entry) -> Service | CalledService:
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
     ours = {} if settings.get("protos") else {"protos": Located(_own_protos(entry.key.span), entry.key.span)}
-    return structure(EnvelopeSettings, settings, **ours)
+    return structure(EnvelopeSettings, settings, name="", **ours)
+
+
+def _named_envelope(entry: Entry) -> EnvelopeSettings:
+    return replace(_envelope(entry), name=entry.key.text)
 
 
 def _own_protos(span: SourceSpan) -> Path:

@@ -66,13 +66,14 @@ class Change:
         return f"{self.at:.1f} s: {self.board} {self.text}"
 
 
-def command_cases(table: RouteTable, board: str) -> frozenset[str]:
+def command_cases(wire: Wire, table: RouteTable, board: str) -> frozenset[str]:
     """Return the payload cases that the table sends to a board with the priority of commands."""
     return frozenset(
-        route.case.value
+        case.name
         for route in table.routes
         if route.priority in (None, Priority.COMMAND)
         and any(destination.endpoint.value == board for destination in route.destinations)
+        for case in wire.envelopes.held(wire.case(route.case.value), board)
     )
 
 
@@ -199,7 +200,7 @@ def boards(
     plans = tuple(deadmen)
     by_name = {}
     for name, endpoint in table.endpoints.items():
-        commands, stops = command_cases(table, name), stops_for(wire, plans, name)
+        commands, stops = command_cases(wire, table, name), stops_for(wire, plans, name)
         if endpoint.kind is EndpointKind.BOARD and (commands or stops):
             by_name[name] = Board(name, commands, stops, changed, obeys.get(name))
             sent = commands | {stop.case for stop in stops}

@@ -109,7 +109,7 @@ def tried_route(
     program = with_stand_ins(program)
     table = program.table
     endpoint = table.endpoints.get(source)
-    listener = endpoint.listener.value if endpoint and endpoint.listener else next(iter(table.listeners))
+    listener = endpoint.listener.value if endpoint and endpoint.listener else wire.envelopes.listener_for(case.name)
     rehearsal = Rehearsal(program)
     rehearsal.datagram(listener, sent_by(endpoint) if endpoint else (LOOPBACK, 0), wire.encode(case, message))
     yield ""
@@ -195,12 +195,16 @@ def _destination(served: Target, checked: CheckedRoute, everything: Checked, how
     """Yield what happens to a message for an endpoint, in this order."""
     endpoint = served.endpoint
     assert endpoint is not None  # noqa: S101 - that of a destination
+    if (held := served.rewrapped) is not None and everything.envelopes is not None:
+        around = everything.envelopes.to(served.label)
+        how = how if served.plan else "the payload"
+        how = f"{how}, as {held.name}, {around.choice.place(around.name, held)}"
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
     yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
     yield from _conditions(served, checked.route)
     yield from _mapping(served)
     if board := everything.boards.get(served.label):
-        yield f"    checked for the board: {', '.join(_bounds(board, checked.case))}"
+        yield f"    checked for the board: {', '.join(_bounds(board, served.rewrapped or checked.case))}"
     yield from _waiting(served)
     if others := [other for other in served.deadmen if other != checked.route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
@@ -247,8 +251,9 @@ def _waiting(served: Target) -> Iterator[str]:
 def _bounds(board: BoardLimits, case: PayloadCase) -> Iterator[str]:
     """Yield the limits of a board's firmware."""
     yield f"at most {plural(board.longest, 'byte')}"
-    payload, prefix = board.payload(case), f"{case.name}."
-    fields = list(_bounded(payload))
+    fields = list(_bounded(board.payload(case)))
+    names = [name for name in (case.name, case.member) if any(field.path.startswith(f"{name}.") for field in fields)]
+    prefix = f"{names[0]}." if names else ""
     if any(field.is_float for field in fields):
         yield "NaN and infinity allowed" if board.allows_non_finite else "no NaN or infinity"
     held = case.wrapping.tag >> 3

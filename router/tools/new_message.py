@@ -89,13 +89,16 @@ def site_of(checked: Checked, messages: Path) -> Site:
     if checked.table is None or checked.envelopes is None:
         raise ValueError(f"{checked.path} has errors")
     settings = checked.table.envelopes.get("")
+    if settings is None and checked.table.envelopes:
+        hint = "write the message, and its route, by hand"
+        raise UsageError(f"{checked.path} has several envelopes: 'router new' adds to a table with `envelope`", hint)
     if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
     if settings.oneof is None:
         hint = "write the message, and its route, by hand"
         raise UsageError(f"{checked.path} has an envelope without a oneof: 'router new' adds members of a oneof", hint)
     # A field's type may be in a file of its own.
-    schema = load_protos(settings.protos, settings.message, settings.lock, settings.exclude, with_others=True)
+    schema = load_protos(settings.protos, settings.message, settings.lock_file, settings.exclude, with_others=True)
     return Site(checked.table, settings, schema, checked.envelopes.first, messages)
 
 

@@ -110,7 +110,7 @@ class Written:
 
 def locked(site: Site) -> str:
     """Return the lock with the new declarations of the `.proto` files. Raises UsageError and TableError."""
-    schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock, site.settings.exclude)
+    schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock_file, site.settings.exclude)
     lock = LockComparison(chosen_envelope(schema, site.settings.choice))
     errors = [finding for finding in lock.findings() if finding.severity is Severity.ERROR]
     if errors:

@@ -225,16 +225,20 @@ class Simulator:
         self._opened: list[socket.socket | Pty] = []
         self._unopened: dict[Pty, Inbox] = {}
         """The ptys that nobody has opened."""
-        self._senders: dict[str, Callable[[bytes], object]] = {}
+        self._senders: dict[str, Callable[[bytes, str], None]] = {}
         self._stopping = False
         try:
             self._routers = {listener.name: listener_address(listener) for listener in table.sockets}
             self._ptys = {line.name: self._kept(Pty(line)) for line in table.lines}
-            # Endpoints without a `listener` send to the first one.
-            self._first = next(iter((*self._routers, *self._ptys)))
+            # Endpoints without a `listener` send to the first one that receives the payload case.
+            names, envelopes = (*self._routers, *self._ptys), wire.envelopes
+            self._first = {
+                case: next((name for name in names if envelopes.at(name) is envelopes.of(case)), names[0])
+                for case in envelopes.cases
+            }
             for endpoint in table.endpoints.values():
                 self._open_endpoint(endpoint)
-            self._senders[STRANGER] = self._sending(self._open(Address(LOOPBACK, 0), STRANGER), self._first)
+            self._senders[STRANGER] = self._sending(self._open(Address(LOOPBACK, 0), STRANGER), None)
         except BaseException:
             self.close()
             raise
@@ -256,11 +260,11 @@ class Simulator:
         The other end of a serial line has its pty.
         """
         inbox = self.statistics.inboxes[endpoint.name]
-        listener = endpoint.listener.value if endpoint.listener is not None else self._first
-        if isinstance(endpoint.address.value, SerialPlace):
+        listener = endpoint.listener.value if endpoint.listener is not None else None
+        if isinstance(endpoint.address.value, SerialPlace) and listener is not None:
             pty = self._ptys[listener]
             self._unopened[pty] = inbox
-            self._senders[endpoint.name] = pty.send
+            self._senders[endpoint.name] = lambda data, _: pty.send(data)
             return
         port = endpoint.source_port.value if endpoint.source_port else 0
         is_learned = endpoint.address.value.is_learned
@@ -272,12 +276,19 @@ class Simulator:
         self._selector.register(receiver, selectors.EVENT_READ, (receiver, inbox))
         self._senders[endpoint.name] = self._sending(sender, listener)
 
-    def _sending(self, sender: socket.socket, listener: str) -> Callable[[bytes], object]:
-        """Return a function that sends from a socket to a listener, or to a serial line if there are only lines."""
-        if (pty := self._ptys.get(listener)) is not None:
-            return pty.send
-        router = self._routers[listener]
-        return lambda data: sender.sendto(data, router)
+    def _sending(self, sender: socket.socket, listener: str | None) -> Callable[[bytes, str], None]:
+        """Return a function that sends the envelope of a payload case from a socket to a listener.
+
+        The default is the first one that receives the case; a serial line only if no other does.
+        """
+
+        def send(data: bytes, case: str) -> None:
+            if (to := listener or self._first[case]) in self._ptys:
+                self._ptys[to].send(data)
+            else:
+                sender.sendto(data, self._routers[to])
+
+        return send
 
     def _kept(self, pty: Pty) -> Pty:
         self._opened.append(pty)
@@ -350,7 +361,7 @@ class Simulator:
             self._numbers[index] += 1
             stream.numbered.set(around if stream.numbered.is_beside else message, self._numbers[index])
         try:
-            self._senders[stream.endpoint](self._wire.encode(stream.case, message, around))
+            self._senders[stream.endpoint](self._wire.encode(stream.case, message, around), stream.case.name)
         except OSError:
             self.statistics.unsent += 1
         else:

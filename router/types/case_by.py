@@ -66,7 +66,7 @@ class _ByField:
 
     def payload(self, frame: Message, case: PayloadCase) -> Message:
         """Return a case that a parsed frame holds. Raises protobuf's DecodeError."""
-        inner: Message = getattr(frame, case.name)
+        inner: Message = getattr(frame, case.member)
         return inner
 
     def why_none(self, envelope: Envelope, frame: Message) -> tuple[str, str]:
@@ -80,7 +80,7 @@ class _ByField:
 
     def put(self, frame: Message, case: PayloadCase, payload: Message) -> None:
         """Make this payload, even an empty one, a parsed frame's."""
-        inner = getattr(frame, case.name)
+        inner = getattr(frame, case.member)
         inner.SetInParent()
         inner.CopyFrom(payload)
 

@@ -79,6 +79,11 @@ class LockComparison:
         return self._schema.lock
 
     @property
+    def unbounded(self) -> str:
+        """Why the envelope has no largest encoding; "" if it has one."""
+        return self._schema.unbounded(self._envelope.name)
+
+    @property
     def max_size(self) -> int | None:
         """The envelope's largest encoding in bytes according to the lock, None without a readable lock."""
         return self.lock.max_size if self.lock is not None else None
@@ -251,7 +256,7 @@ def _envelope_text(lock: Lock) -> str:
 
 def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None, table: Path | None) -> str:
     """Return the command that records these protos, to be run in the router's working directory."""
-    if envelope.choice.by != BY_ONEOF and table is not None:
+    if table is not None and (envelope.label or envelope.choice.by != BY_ONEOF):
         return shlex.join(["router", "schema", "lock", "--table", shown_path(table)])
     message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
     words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]

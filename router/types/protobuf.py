@@ -33,7 +33,7 @@ from router.types.boards import (
     unbounded_fields,
 )
 from router.types.case_by import ByOneof, Choice, Wrapping
-from router.types.descriptors import declared_type, enum_of, message_of
+from router.types.descriptors import declared_type, enum_of, message_of, same_type
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Bytes, Enum, Field, List, MessageType, String, Type
 from router.types.nanopb import NO_OPTIONS, BoardOptions, NanopbOptions, OptionsFile, declares_options, read_options
@@ -133,7 +133,8 @@ class PayloadCase:
     """One of the messages that an envelope can hold. `number` is unique among them: that of its field, if it has one.
 
     `max_size` is the largest encoding of the payload in bytes as nanopb computes it, None when unbounded. `wrapped`
-    says how the envelope holds it, None for a field with its number.
+    says how the envelope holds it, None for a field with its number. `envelope` is the label of the envelope, which
+    also begins `name` if another one has a case of that name.
     """
 
     name: str
@@ -142,6 +143,16 @@ class PayloadCase:
     message_class: MessageClass
     max_size: int | None
     wrapped: Wrapping | None = None
+    envelope: str = ""
+
+    @property
+    def descriptor(self) -> Descriptor:
+        return self.message_class.DESCRIPTOR  # type: ignore[return-value]  # of upb
+
+    @property
+    def member(self) -> str:
+        """The field of the envelope, of a case that is one."""
+        return self.name.rpartition(".")[2]
 
     @property
     def wrapping(self) -> Wrapping:
@@ -181,6 +192,8 @@ class Envelope:
     unroutable: Mapping[str, Unroutable] = field(default_factory=dict)
     beside: MessageType = field(default_factory=lambda: MessageType(""))
     parts: frozenset[str] = frozenset()
+    label: str = ""
+    """Its name in a table with several."""
 
     @property
     def numbers(self) -> Mapping[str, int]:
@@ -198,7 +211,13 @@ class Envelope:
 
     def members_of(self, frame: Message) -> Sequence[str]:
         """Return the names of the cases that a parsed frame holds, even of those that no route can take."""
-        return self.choice.members_of(frame) if self.cases or self.unroutable else ()
+        names = self.choice.members_of(frame) if self.numbers else ()
+        return [name if name in self.numbers else f"{self.label}.{name}" for name in names]
+
+    def holding(self, case: PayloadCase) -> Sequence[PayloadCase]:
+        """Return the cases with the type of a case of another envelope; if one of several has its name, only that."""
+        found = [each for each in self.cases.values() if same_type(each.descriptor, case.descriptor)]
+        return [each for each in found if each.member == case.member and len(found) > 1] or found
 
     def payloads_of(self, frame: Message) -> list[tuple[PayloadCase, Message]]:
         """Return the payloads of a parsed frame that a route can take, with their cases.

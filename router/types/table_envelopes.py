@@ -2,14 +2,48 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 
 from router.errors import did_you_mean
 from router.types.model import Enum
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, Unroutable
+
+
+def told_apart(by_name: Mapping[str, Envelope]) -> Mapping[str, Envelope]:
+    """Return the envelopes with the name of the envelope before each case that several of them have."""
+    return {label: _named(by_name[label], label, names) for label, names in _names(by_name).items()}
+
+
+def written_alike(by_name: Mapping[str, Envelope]) -> tuple[str, str] | None:
+    """Return an envelope with a case that would be written as another one is, and that text; None if all differ."""
+    found: set[str] = set()
+    for label, names in _names(by_name).items():
+        for name in names.values():
+            if name in found:
+                return label, name
+            found.add(name)
+    return None
+
+
+def _names(by_name: Mapping[str, Envelope]) -> Mapping[str, Mapping[str, str]]:
+    """Return how the cases of each envelope are written in a table, by their names."""
+    holders = Counter(case for envelope in by_name.values() for case in envelope.numbers)
+    return {
+        label: {name: f"{label}.{name}" if holders[name] > 1 else name for name in envelope.numbers}
+        for label, envelope in by_name.items()
+    }
+
+
+def _named(envelope: Envelope, label: str, names: Mapping[str, str]) -> Envelope:
+    """Return the envelope with its name, and the names of its cases, in a table."""
+    cases = {names[name]: replace(case, name=names[name], envelope=label) for name, case in envelope.cases.items()}
+    unroutable = {names[name]: member for name, member in envelope.unroutable.items()}
+    parts = frozenset(names[name] for name in envelope.parts)
+    return replace(envelope, cases=cases, unroutable=unroutable, parts=parts, label=label)
 
 
 @dataclass(frozen=True)
@@ -27,6 +61,11 @@ class Envelopes:
     def first(self) -> Envelope:
         """The only envelope of most tables."""
         return next(iter(self.by_name.values()))
+
+    @property
+    def title(self) -> str:
+        """The messages of all envelopes."""
+        return " or ".join(envelope.name for envelope in self.by_name.values())
 
     @property
     def schemas(self) -> Sequence[ProtoSchema]:
@@ -74,9 +113,23 @@ class Envelopes:
         """Return the envelope that holds a payload case, also one that no route can take. Raises KeyError."""
         return self._holders[case]
 
+    def held(self, case: PayloadCase, endpoint: str) -> Sequence[PayloadCase]:
+        """Return the payload cases as which an endpoint may get a payload of `case`: those of its type, if it gets
+        another envelope.
+        """
+        around = self.to(endpoint)
+        return [case] if around is self.of(case.name) else around.holding(case)
+
+    def listener_for(self, case: str) -> str:
+        """Return the first listener that receives this payload case."""
+        holder = self.of(case)
+        return next((name for name in self.listeners if self.at(name) is holder), next(iter(self.listeners)))
+
     def unknown_case(self, name: str) -> tuple[str, str]:
         """Return message and hint for the name of a payload case that does not exist."""
-        return f"{self.first.name} has no payload case '{name}'", did_you_mean(name, self.cases)
+        if several := [each for label in self.by_name if (each := f"{label}.{name}") in self.numbers]:
+            return f"several envelopes have the payload case '{name}'", f"write {' or '.join(several)}"
+        return f"{self.title} has no payload case '{name}'", did_you_mean(name, self.cases)
 
     @property
     def sha256(self) -> str:

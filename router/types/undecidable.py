@@ -7,7 +7,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from router.errors import Code, Diagnostic, SourceSpan
-from router.types.descriptors import container
+from router.types.descriptors import all_fields, all_types, container
 from router.types.wire import delimited, parses
 
 MOST_TYPES = 65536
@@ -47,22 +47,3 @@ def _of_type(descriptor: Descriptor) -> Iterator[_Found]:
         if is_group and not parses(container(field), delimited(field.number, b"\xff")):
             what = f"protobuf before 7.36 parses {field.full_name}, a group, as a message"
             yield field.full_name, what, "make it a message"
-
-
-def all_types(*roots: Descriptor) -> dict[Descriptor, int]:
-    """Return these messages and all types of their fields, at any depth, each with an index; the first one's is 0."""
-    indexes = {root: index for index, root in enumerate(dict.fromkeys(roots))}
-    pending = [*indexes]
-    while pending:
-        for field in all_fields(pending.pop()):
-            if field.message_type is not None and field.message_type not in indexes:
-                indexes[field.message_type] = len(indexes)
-                pending.append(field.message_type)
-    return indexes
-
-
-def all_fields(descriptor: Descriptor) -> Iterator[FieldDescriptor]:
-    """Yield the fields of a message and the extensions in its pool: protobuf parses both in the same way."""
-    yield from descriptor.fields
-    if descriptor.is_extendable:
-        yield from descriptor.file.pool.FindAllExtensions(descriptor)

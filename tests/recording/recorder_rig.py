@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -130,8 +130,13 @@ class Listed(list[Any]):
         return iter(pickle.loads(records) if records else ())  # noqa: S301 - what it has dumped
 
 
-def write(path: Path, channels: Channels, *batches: Batch, finish: bool = True) -> Path:
-    file, encoder = RecordingFile(path, channels, {"reason": "test"}), Encoder(channels)
+ABOUT = {"reason": "test"}
+
+
+def write(
+    path: Path, channels: Channels, *batches: Batch, finish: bool = True, metadata: Mapping[str, str] = ABOUT
+) -> Path:
+    file, encoder = RecordingFile(path, channels, {**metadata}), Encoder(channels)
     for batch in batches:
         file.write(encoder.messages(batch))
     if finish:

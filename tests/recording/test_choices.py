@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 from router.compiler import check_table
 from router.compiler.compiled_table import CompiledTable
 from router.datagrams import Wire
+from router.recording.about import about
 from router.recording.channels import Channels
 from router.recording.encoder import Packer
-from router.recording.mirror import SENT, Action, Classifier
+from router.recording.mirror import SENT, Action, Classifier, MirroredDatagram
 from router.recording.reader import Recorded, RecordedAction, Recording
-from router.recording.schemas import recorded_envelope
-from router.types.table_envelopes import Envelopes
+from router.recording.schemas import recorded_envelopes
 from tests.recording.recorder_rig import START, Listed, shown, write
 
 TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
@@ -54,7 +54,7 @@ def test_datagrams_and_payloads_come_back(table: str, datagrams: list[bytes], tm
     packed = Packer().pack(Listed(batch), Listed(sent), classifier, START, 0)
     path = write(tmp_path / "it.mcap", Channels(), packed)
     with closing(Recording(path)) as recording:
-        found = Wire(Envelopes({"": recorded_envelope(recording.cases())}))
+        found = Wire(recorded_envelopes(recording.cases(), recording.about))
         records = list(recording.everything())
     assert [record.data for record in records if isinstance(record, Recorded)] == datagrams
     assert [record.action.data for record in records if isinstance(record, RecordedAction)] == [datagrams[0]]
@@ -74,3 +74,40 @@ def test_viewers_get_each_message_of_a_datagram(tmp_path: Path) -> None:
         found = {channel.topic: message.data for _, channel, message in make_reader(file).iter_messages()}
     assert found["geometry"] == b"\x08\x09"
     assert found["detection"] == b"\x08\x05\x12\x00"
+
+
+def test_several_envelopes_come_back(tmp_path: Path) -> None:
+    made = program("several.yaml")
+    envelopes = made.envelopes
+
+    def encoded(name: str) -> bytes:
+        case, fields = envelopes.cases[name], {} if name.endswith("status") else {"level": 1}
+        return envelopes.of(name).around(case, case.message_class(**fields)).SerializeToString()
+
+    received = {"game.status": "game", "crowd.status": "crowd", "crowd.light": "crowd"}
+    sent = {"show.light": "stage", "Light": "logger", "lamp": "lamp"}
+    batch = [MirroredDatagram(START, at, ("127.0.0.1", 5), "", "", encoded(name)) for name, at in received.items()]
+    acted = [Action(START, SENT, "crowd.light", to, data=encoded(name)) for name, to in sent.items()]
+    packed = Packer().pack(Listed(batch), Listed(acted), Classifier(envelopes, made.table), START, 0)
+    path = write(tmp_path / "it.mcap", Channels(), packed, metadata=about(made.table, "test"))
+    with closing(Recording(path)) as recording:
+        found = Wire(recorded_envelopes(recording.cases(), recording.about))
+        records = [*recording.everything()]
+    datagrams = [each for each in records if isinstance(each, Recorded)]
+    actions = [each.action for each in records if isinstance(each, RecordedAction)]
+    assert [each.data for each in datagrams] == [each.data for each in batch]
+    names = [found.decode(each.data, found.envelopes.at(each.listener)).case.name for each in datagrams]
+    assert names == [*received]
+    assert [found.decode(each.data, found.envelopes.to(each.target)).case.name for each in actions] == [*sent]
+
+
+def test_an_envelope_without_recorded_payloads_is_not_taken_for_another(tmp_path: Path) -> None:
+    made = program("several.yaml")
+    case = made.envelopes.cases["game.status"]
+    batch = [MirroredDatagram(START, "game", ("127.0.0.1", 5), "", "", case.message_class().SerializeToString())]
+    packed = Packer().pack(Listed(batch), Listed(list[Action]()), Classifier(made.envelopes, made.table), START, 0)
+    path = write(tmp_path / "it.mcap", Channels(), packed, metadata=about(made.table, "test"))
+    with closing(Recording(path)) as recording:
+        found = recorded_envelopes(recording.cases(), recording.about)
+    assert found.at("crowd").cases_in(b"\x1a\x00") == []
+    assert [*found.at("game").cases] == ["game.status"]

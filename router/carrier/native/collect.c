@@ -9,6 +9,7 @@
 #include "evaluate.h"
 #include "events.h"
 #include "lists.h"
+#include "payload.h"
 #include "timers.h"
 #include "wire.h"
 
@@ -171,21 +172,6 @@ static void compact(struct collector *collector) {
         kept += length;
     }
     collector->used = kept;
-}
-
-/* Write the payload of a datagram, and return its size. Joining its pieces merges them. */
-static uint32_t write_payload(const struct datagram *from, uint8_t *to) {
-    struct bytes rest = {from->data + from->start, from->data + from->start + from->length}, piece;
-    uint32_t tag = 0, size = 0;
-    if (from->is_single) {
-        memcpy(to, rest.at, from->length);
-        return from->length;
-    }
-    while (rest.at < rest.end && read_piece(&rest, &tag, &piece)) {
-        memcpy(to + size, piece.at, bytes_left(&piece));
-        size += (uint32_t)bytes_left(&piece);
-    }
-    return size;
 }
 
 /* Keep the payload of a datagram. There is room: kept records never take more than half of the store. */
@@ -412,7 +398,7 @@ static bool read_frame(struct machine *machine, const struct targets *to, const 
     const struct collect *of = to->collect;
     struct value first = payload_of(of->collector, frame, 0), items = {.size = 0};
     begin_datagram(machine, to->layout, to->sources, last);
-    if (!machine_read(machine, first.bytes, first.size) || !machine_read_envelope(machine, last->data, last->size))
+    if (!machine_read(machine, first.bytes, first.size) || !machine_read_envelope(machine, last))
         return false;
     for (uint32_t index = 0; of->items != NONE && index < frame->count; index++)
         if (!list_add(machine, &items, payload_of(of->collector, frame, index)))

@@ -87,7 +87,7 @@ bool read_datagram(struct machine *machine, const struct layout *layout, const s
     const uint8_t *payload = from->data + from->start;
     bool is_read = from->is_single ? machine_read(machine, payload, from->length)
                                    : machine_read_pieces(machine, payload, from->length);
-    return is_read && machine_read_envelope(machine, from->data, from->size);
+    return is_read && machine_read_envelope(machine, from);
 }
 
 /* Read the message, unless it was already read for another target. */

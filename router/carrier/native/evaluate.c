@@ -6,6 +6,7 @@
 #include "deliver.h"
 #include "events.h"
 #include "lists.h"
+#include "payload.h"
 #include "state_value.h"
 #include "texts.h"
 #include "utf8.h"
@@ -46,6 +47,14 @@ static bool unpack(struct machine *machine, struct value *list, enum scalar stor
     while (list->size)
         if (!list_add(machine, &made, list_next(machine, list, stored))) return false;
     *list = made;
+    return true;
+}
+
+/* ---- payloads ---- */
+
+static bool append_payload(struct output *output, const struct datagram *from) {
+    if (!has_room(output, from->length)) return false;
+    output->size += write_payload(from, output->data + output->size);
     return true;
 }
 
@@ -282,6 +291,7 @@ static int execute(struct machine *machine, const struct routine *routine, uint3
             WANT(fits_float32(top[1].real) && write_fixed(output, op->size, float32_bits(top[1].real), 4, op->flag));
         case OP_WRITE_DOUBLE: top--; WANT(write_fixed(output, op->size, float64_bits(top[1].real), 8, op->flag));
         case OP_WRITE_BYTES: top--; WANT(write_bytes(output, op->size, top + 1, op->flag));
+        case OP_PAYLOAD: WANT(append_payload(output, machine->datagram));
         }
     }
     return EVALUATED;

@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "deliver.h"
 #include "read_cdr.h"
 #include "read_protobuf.h"
 
@@ -47,9 +48,11 @@ bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t si
     return check_read(machine, read_protobuf_pieces(machine, 0, data, size));
 }
 
-bool machine_read_envelope(struct machine *machine, const uint8_t *data, size_t size) {
+bool machine_read_envelope(struct machine *machine, const struct datagram *from) {
     uint16_t envelope = machine->layout->envelope;
-    return !envelope || check_read(machine, read_protobuf(machine, envelope, data, size));
+    if (!envelope) return true;
+    machine->datagram = from;
+    return check_read(machine, read_protobuf(machine, envelope, from->data, from->size));
 }
 
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element) {

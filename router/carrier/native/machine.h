@@ -26,6 +26,7 @@ enum {
     BYTES_PER_TURN = 16
 };
 
+struct datagram;
 struct thread_env;
 
 struct machine {
@@ -38,6 +39,7 @@ struct machine {
     size_t text_size;
     uint32_t work_left;                   /* of MOST_WORK */
     const uint8_t *message, *message_end; /* the last message read; offsets in CDR count from its first byte */
+    const struct datagram *datagram;      /* of the last envelope read */
     struct output output;                 /* the last message written */
     struct refusal refusal;               /* the last refusal, */
     struct value refused;                 /* and its text, or an empty one */
@@ -72,8 +74,9 @@ bool machine_read(struct machine *machine, const uint8_t *data, size_t size);
 /* The same for a protobuf message in pieces (read_protobuf.h). */
 bool machine_read_pieces(struct machine *machine, const uint8_t *data, size_t size);
 
-/* Read the fields of an envelope beside the payload into the slots, if the layout has any. Fails like `machine_read`. */
-bool machine_read_envelope(struct machine *machine, const uint8_t *data, size_t size);
+/* Read the fields of an envelope beside the payload into the slots, if the layout has a section for them. Fails like
+ * `machine_read`. OP_PAYLOAD needs it: the datagram must exist until the next begin. */
+bool machine_read_envelope(struct machine *machine, const struct datagram *from);
 
 /* Give the slots of a section their defaults, and read an element of a list of messages into them. */
 bool machine_enter(struct machine *machine, uint16_t section, const struct value *element);

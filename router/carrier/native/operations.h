@@ -167,7 +167,8 @@ enum op {
     OP_WRITE_FIXED64,
     OP_WRITE_FLOAT, /* refuses a finite number that is infinite as a float32 */
     OP_WRITE_DOUBLE,
-    OP_WRITE_BYTES /* and text */
+    OP_WRITE_BYTES, /* and text */
+    OP_PAYLOAD /* writes the payload of the datagram, as it was received */
 };
 
 /* Which operands of an operation with integers are unsigned, and whether its result is. */
@@ -286,7 +287,7 @@ struct layout {
     const uint8_t *literals;
     uint32_t slot_count;
     uint16_t is_cdr;
-    uint16_t envelope; /* section of the envelope of a datagram, 0 if no routine reads fields beside the payload */
+    uint16_t envelope; /* section of the envelope of a datagram, 0 if no routine needs it (machine_read_envelope) */
     const struct state_settings *states; /* of the program; NULL without any */
 };
 

@@ -230,7 +230,8 @@ static int evaluate_on_payload(struct machine *machine, const struct layout *lay
     machine->slots[SLOT_RECEIVED_AT].integer = received_at;
     machine->slots[SLOT_SOURCE] = *source;
     bool is_read = machine_read(machine, payload->bytes, payload->size);
-    if (!is_read || !machine_read_envelope(machine, beside->bytes, beside->size)) return DROP_MAPPING_ERROR;
+    struct datagram envelope = {.data = beside->bytes, .size = beside->size};
+    if (!is_read || !machine_read_envelope(machine, &envelope)) return DROP_MAPPING_ERROR;
     return evaluate_condition(machine, condition, holds, &at);
 }
 

@@ -64,7 +64,7 @@ def lower_table(
     obeyed: dict[str, LoweredCondition] = {}
     findings: list[Diagnostic] = []
     for checked in routes:
-        filtered = [target for target in checked.targets if not target.topic and target.when is not None]
+        filtered = [target for target in checked.targets if not target.topic and (target.when or target.rewrapped)]
         published = [target for target in checked.targets if target.topic]
         for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
             with _limits_in(findings):

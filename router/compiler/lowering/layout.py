@@ -57,7 +57,7 @@ class PlacedSection(NamedTuple):
 class Layout:
     """`struct layout`. The first section is the source message.
 
-    `envelope` is the section of the envelope, 0 if no routine reads fields beside the payload. `closed` are the numbers
+    `envelope` is the section of the envelope, 0 if no routine needs it. `closed` are the numbers
     of closed enums, ascending. `names` describe the slots and `messages` the sections, for `explain`.
     """
 
@@ -106,12 +106,12 @@ def protobuf_layout(
 ) -> Layout:
     """Number `slots` from 0, then those of the payload, the envelope and list elements. Return the layout."""
     maker = _ProtobufNumbering(slots)
-    beside = (envelope,) if envelope is not None and envelope.wanted else ()
-    roots = payload, *beside, *elements
+    around = [envelope] if envelope is not None else []
+    roots = [payload, *around, *elements]
     maker.number_sections([*chain.from_iterable(map(_all, roots))])
     for root in roots:
         maker.place(root)
-    return maker.made(is_cdr=False, closed=maker.closed.values(), envelope=beside[0].index if beside else 0)
+    return maker.made(is_cdr=False, closed=maker.closed.values(), envelope=around[0].index if around else 0)
 
 
 def _all(section: Section) -> Iterator[Section]:

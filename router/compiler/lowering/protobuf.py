@@ -17,6 +17,7 @@ from router.compiler.lowering.numbers import to_real
 from router.compiler.lowering.operations import Operation, Routine, known
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.declared import Op
+from router.errors import SourceSpan
 from router.types.descriptors import container, message_of
 from router.types.protobuf import PayloadCase
 from router.types.wire import GROUP, GROUP_END, LEN, encoding_of, varint
@@ -27,8 +28,16 @@ _CLOSE = Operation(Op.CLOSE)
 def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b"") -> list[Placed]:
     """Return the operations that write an envelope, each with its place: the bytes `beside`, and the payload."""
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
-    place = Place(plan.span, "")
-    inside = _Writer(lowering).record(plan, descriptor, "")
+    return _around(_Writer(lowering).record(plan, descriptor, ""), case, beside, Place(plan.span, ""))
+
+
+def rewrapped(case: PayloadCase, beside: bytes, span: SourceSpan) -> list[Placed]:
+    """Likewise with the payload of the datagram, as it was received."""
+    place = Place(span, "")
+    return _around([(Operation(Op.PAYLOAD), place)], case, beside, place)
+
+
+def _around(inside: Iterable[Placed], case: PayloadCase, beside: bytes, place: Place) -> list[Placed]:
     around = case.wrapping
     if around.tag:
         inside = _lengthened(around.tag, list(merged(inside)), place, is_always=not around.is_optional)

@@ -28,7 +28,7 @@ from router.compiler.lowering.messages import Placed
 from router.compiler.lowering.names import Meaning, Names, TooLargeError
 from router.compiler.lowering.numbers import signs
 from router.compiler.lowering.operations import Operation, Routine, Slot, chained, depths, most_executed, nesting
-from router.compiler.lowering.protobuf import protobuf_fields, protobuf_message
+from router.compiler.lowering.protobuf import protobuf_fields, protobuf_message, rewrapped
 from router.compiler.lowering.sections import Section
 from router.compiler.lowering.steps import cdr_layout
 from router.compiler.plan import Record
@@ -154,6 +154,7 @@ class Datagram(_Source):
             around: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
             self._envelope = Section(envelope.beside, around, f"{tree.ENVELOPE}.")
             self.variables[tree.ENVELOPE] = self._envelope
+        self._is_rewrapped = False
 
     def lowered(self, checked: CheckedRoute, targets: Sequence[Target]) -> LoweredRoute:
         """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
@@ -189,7 +190,7 @@ class Datagram(_Source):
             lowering.names.variables |= elements.variables
             splits = f"{target.for_each.span}: for_each"
         condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
-        message, places = self.published(lowering, target.plan) if target.plan is not None else ((), ())
+        message, places = self._message(lowering, target)
         gate = self.gate(target, [target.when])
         places = ("", when, collect, splits, *places)
         return replace(target, condition=condition, gate=gate, message=message, places=places)
@@ -206,18 +207,27 @@ class Datagram(_Source):
         _require_fast(routine, span, "`order`")
         return LoweredOrder(routine, self.layout(span), order.bits, order.is_unsigned)
 
+    def _message(self, lowering: Lowering, target: Target) -> tuple[Routine, tuple[str, ...]]:
+        """Lower the message of a target, with the place of each operation; nothing for a datagram as received."""
+        if target.rewrapped is not None:
+            self._is_rewrapped = True
+            beside = target.beside.data if target.beside else b""
+            return _with_places(rewrapped(target.rewrapped, beside, target.span))
+        return self.published(lowering, target.plan) if target.plan is not None else ((), ())
+
     def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
         """Lower the ROS message of a topic, with the place of each operation."""
         return _with_places(cdr_message(lowering, plan))
 
     def layout(self, span: SourceSpan) -> Layout:
         """Return the layout of all routines made so far. Raises TooLargeError."""
-        around = (self._envelope,) if self._envelope is not None else ()
+        envelope = self._envelope if self._envelope and (self._envelope.wanted or self._is_rewrapped) else None
+        around = (envelope,) if envelope is not None else ()
         for section in (self.root, *around, *self.elements):
             if (depth := section.depth()) >= MOST_SECTIONS_DEEP:
                 message = f"this reads a field {depth} messages deep; the limit is {MOST_SECTIONS_DEEP - 1}"
                 raise TooLargeError(span, message, "read less deeply nested fields")
-        return _small(protobuf_layout(self.temporaries, self.root, self._envelope, self.elements), span)
+        return _small(protobuf_layout(self.temporaries, self.root, envelope, self.elements), span)
 
 
 class RosMessage(_Source):
@@ -238,7 +248,7 @@ class RosMessage(_Source):
             condition, when = self.condition(lowering, [feed.when, target.when])
             assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
             beside = target.beside.data if target.beside else b""
-            message, places = self.sent(lowering, target.plan, checked.case, beside)
+            message, places = self.sent(lowering, target.plan, target.rewrapped or checked.case, beside)
             all_places = f"{feed.topic.span}: a malformed message", when, "", place, *places
             gate = self.gate(target, [feed.when, target.when])
             targets[target.label] = replace(target, condition=condition, gate=gate, message=message, places=all_places)

@@ -13,7 +13,7 @@ from router.table.grammar.keys import BOOLEAN, TEXT, Schema, key, mapping, part,
 from router.table.grammar.parts import PARTS
 from router.table.grammar.rules import COMPLETE
 from router.table.grammar.values import VALUES
-from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
+from router.table.model.settings import NodeSettings, RecordSettings, ServerSettings
 
 
 def table_schema() -> Schema:
@@ -56,7 +56,18 @@ _KEYS: Schema = {
         TEXT,
         "rover.yaml",
     ),
-    "envelope": part(EnvelopeSettings),
+    "envelope": ref("envelope"),
+    "envelopes": key(
+        "Envelopes",
+        "Instead of 'envelope', if not all peers speak the same protocol: envelopes by name. Each listener, and each "
+        "endpoint that is sent to, then has the key 'envelope'. A payload case that two of them have is written "
+        "NAME.CASE.",
+        {"minProperties": 1, **_by_name("envelope", ("any", "ros"))},
+        {
+            "vision": {"message": "SSL_WrapperPacket", "oneof": "payload"},
+            "referee": {"message": "R", "case": "referee"},
+        },
+    ),
     "node": {**part(NodeSettings), "default": {"name": _NODE.name, "namespace": _NODE.namespace}},
     "http": key(
         "HTTP",

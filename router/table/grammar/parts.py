@@ -18,6 +18,7 @@ from router.table.model.services import (
     ServiceRequest,
     ServiceSource,
 )
+from router.table.model.settings import EnvelopeSettings
 from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
 
@@ -211,6 +212,7 @@ _LISTENER = {
 }  # fmt: skip
 
 PARTS: Schema = {
+    "envelope": part(EnvelopeSettings),
     "listener": _LISTENER,
     "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,

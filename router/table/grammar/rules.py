@@ -57,6 +57,17 @@ _IS_JSON: Schema = {"anyOf": [
     _has(format={"enum": ["json", "json_lines"]}),
     {**_over("websocket"), "not": {"required": ["format"]}},
 ]}  # fmt: skip
+_ENVELOPE: Schema = {
+    "required": ["message"],
+    "if": {"required": ["case"]},
+    "then": without("oneof|cases", "is not allowed with 'case': with it, the datagram itself is the message"),
+    "else": {
+        **without("payload", "needs 'case', the field that names the message"),
+        "if": {"required": ["cases"]},
+        "then": without("oneof", "is not allowed with 'cases': either says which fields are payload cases"),
+        "else": {"required": ["oneof"]},
+    },
+}
 COMPLETE: Schema = {
     "complete": {
         "$comment": "The keys that are required once a table is merged with all that it extends. Lists replace, so the "
@@ -66,21 +77,15 @@ COMPLETE: Schema = {
             "required": ["gateways"],
             "properties": {"gateways": {"minProperties": 1}, "listen": False, "routes": False},
         },
-        "else": {"required": ["envelope", "listen", "routes"]},
+        "else": {
+            "required": ["listen", "routes"],
+            "if": {"required": ["envelopes"]},
+            "then": without("envelope", "is not allowed with 'envelopes'"),
+            "else": {"required": ["envelope"]},
+        },
         "properties": {
-            "envelope": {
-                "required": ["message"],
-                "if": {"required": ["case"]},
-                "then": without(
-                    "oneof|cases", "is not allowed with 'case': with it, the datagram itself is the message"
-                ),
-                "else": {
-                    **without("payload", "needs 'case', the field that names the message"),
-                    "if": {"required": ["cases"]},
-                    "then": without("oneof", "is not allowed with 'cases': either says which fields are payload cases"),
-                    "else": {"required": ["oneof"]},
-                },
-            },
+            "envelope": _ENVELOPE,
+            "envelopes": _each(_ENVELOPE),
             "http": {"required": ["address"]},
             "record": {"required": required(RecordSettings)},
             "foxglove": {"required": ["address"]},

@@ -33,6 +33,9 @@ class Networks:
         return f"the networks of {self.span.file}:{self.span.line} ({', '.join(map(str, self.members))})"
 
 
+_SEVERAL = 2
+
+
 @dataclass(frozen=True, slots=True)
 class RouteTable:
     """A table after `extends` and variables. `files` are all files read, the table itself first.
@@ -77,5 +80,9 @@ class RouteTable:
 
     @property
     def envelope_names(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """The name of the envelope of each listener, and of each endpoint."""
-        return dict.fromkeys(self.listeners, ""), dict.fromkeys(self.endpoints, "")
+        """The name of the envelope of each listener, and of each endpoint; "" if it names none of several."""
+        only = next(iter(self.envelopes), "") if len(self.envelopes) < _SEVERAL else ""
+        return (
+            {each.name: each.envelope.value if each.envelope else only for each in self.listeners.values()},
+            {each.name: each.envelope.value if each.envelope else only for each in self.endpoints.values()},
+        )

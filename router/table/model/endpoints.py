@@ -67,6 +67,11 @@ class Listener:
     Example: [224.5.23.2]
     """
     line: SerialLine | None = None
+    envelope: Located[str] | None = None
+    """Which of the table's `envelopes` its datagrams are. Needed if there are several.
+
+    Example: vision
+    """
 
     @property
     def bound_to(self) -> str:
@@ -193,6 +198,11 @@ class Endpoint:
     sending, which as a number is in seconds, as in `now * 1000`. Forwarded messages keep their own.
 
     Example: {seq: sequence, sent_at: now, robot: 3}
+    """
+    envelope: Located[str] | None = None
+    """Which of the table's `envelopes` it gets. Needed if there are several and something is sent to it.
+
+    Example: command
     """
 
     @property

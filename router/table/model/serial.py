@@ -94,3 +94,8 @@ class SerialLine:
     """The parity bit of each byte."""
     stop_bits: Annotated[int, Range(1, 2)] = 1
     """The number of stop bits after each byte."""
+    envelope: Located[str] | None = None
+    """Which of the table's `envelopes` its frames are. Needed if there are several.
+
+    Example: robot
+    """

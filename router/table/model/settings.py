@@ -16,7 +16,8 @@ from router.table.units import DISK_SIZE, DURATION
 class EnvelopeSettings:
     """Which protobuf message wraps every payload on the wire.
 
-    `protos` and `lock` are absolute paths; without `lock`, the lock file is beside the protos.
+    `protos` and `lock` are absolute paths; without `lock`, the lock file is beside the protos. One of several envelopes
+    has a `name`.
     """
 
     protos: Located[Path]
@@ -61,7 +62,8 @@ class EnvelopeSettings:
     """
     lock: Located[Path] | None = None
     """The file that records the field numbers, relative to this file. Default: envelope.lock.json in the folder of the
-    .proto files. Set it if that folder is not yours to change, such as a submodule.
+    .proto files; for one of `envelopes`, NAME.lock.json there. Set it if that folder is not yours to change, such as a
+    submodule.
 
     Title: Lock file
     Example: ../envelope.lock.json
@@ -80,6 +82,14 @@ class EnvelopeSettings:
     Example: boards do not check the sequence number
     Error: must be a text that says why these fields may be empty
     """
+    name: str = ""
+
+    @property
+    def lock_file(self) -> Located[Path] | None:
+        """The lock file, None for the default of a table with one envelope."""
+        if self.lock is not None or not self.name:
+            return self.lock
+        return Located(self.protos.value / f"{self.name}.lock.json", self.protos.span)
 
     @property
     def choice(self) -> Mapping[str, Sequence[Located[str]]]:

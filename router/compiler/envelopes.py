@@ -1,0 +1,40 @@
+"""Checks which of several envelopes each listener and endpoint has, and that each envelope has its own lock file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from router.errors import Code, Diagnostic, did_you_mean
+from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, Listener
+from router.types.protobuf import lock_path
+
+
+def envelope_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for listeners and endpoints that name an unknown envelope, or none of several."""
+    known = [name for name in table.envelopes if name]
+    deadmen = [route.deadman for route in table.routes if route.deadman]
+    recipients = {to.endpoint.value for route in table.routes for to in route.destinations}
+    recipients |= {to.value for deadman in deadmen for to in deadman.to}
+    places: list[Listener | Endpoint] = [*table.listeners.values(), *table.endpoints.values()]
+    for place in places:
+        if place.envelope is not None:
+            name = place.envelope.value
+            if name not in known and f"envelopes/{name}" not in table.broken:
+                hint = did_you_mean(name, known) or "add it to 'envelopes'"
+                yield Diagnostic(place.envelope.span, Code.UNKNOWN_ENVELOPE, f"there is no envelope '{name}'", hint)
+        elif len(known) > 1 and (isinstance(place, Listener) or place.name in recipients):
+            what = f"'{place.name}' does not say which envelope it has"
+            yield Diagnostic(place.span, Code.MISSING_KEY, what, f"add `envelope: {' or '.join(known)}`")
+
+
+def shared_lock_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for envelopes with the lock file of another one: a lock file records one envelope."""
+    first: dict[Path, str] = {}
+    for name, settings in table.envelopes.items():
+        owner = first.setdefault(lock_path(settings.protos, settings.lock_file), name)
+        if owner != name:
+            message = f"the envelopes '{owner}' and '{name}' have the same lock file, which records only one"
+            hint = f"write `lock: {name}.lock.json` in '{name}'"
+            yield Diagnostic((settings.lock or settings.message).span, Code.BAD_VALUE, message, hint)
