@@ -46,6 +46,7 @@ def check_called(
         halves = service_type(lookup, declared.call.type)
         if source is None or reply is None or endpoint is None or halves is None:
             continue
+        lookup.require_listener(source, declared.source.source)
         kept = _kept(source)
         services.append(CheckedCalled(declared, *halves, _PLACE * _places(kept)))
         target = _request(lookup, declared, source, halves[0], kept)
