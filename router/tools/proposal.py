@@ -90,7 +90,8 @@ def table_text(envelope: Candidate, others: Sequence[Candidate], protos: str) ->
 
 _HEADER = """\
 # A table to begin with, proposed by `router init --protos`: each payload of the envelope becomes a topic with the first
-# numbers of the message. Give each topic the type and the fields that you want, and the robot its address. To send a
+# numbers of the message. Give each topic the type and the fields that you want, and the robot its address. If it is on
+# a serial line, the listener has `serial`, `baud` and `framing` instead, and the robot `listener: robot`. To send a
 # payload to the robot, write `source: {topic: NAME}` and `destinations: robot` instead.
 
 version: 1

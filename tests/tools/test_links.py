@@ -11,13 +11,21 @@ from pathlib import Path
 
 import pytest
 
+from router.app import Router
 from router.carrier.frames import Frame
 from router.cli import main
+from router.compiler import check_table
+from router.datagrams import Wire
 from router.errors import UsageError
+from router.recording.mirror import Mirrored, MirroredDatagram
 from router.table import read_table
 from router.table.model.endpoints import Listener
+from router.tools.board import State
 from router.tools.links import Device, Pty
+from router.tools.simulator import Simulator, parse_silence
 from tests.acceptance.site import wait_until
+from tests.ports import free_port
+from tests.tables import PROTOS
 
 EMPTY_PLAIN, EVERY_KIND = bytes.fromhex("1200"), bytes.fromhex("0a021005")
 
@@ -177,3 +185,42 @@ def test_listen_ends_when_the_device_is_unplugged(line: Listener, line_path: Pat
         _, err = tap.communicate(timeout=30)
     assert "'uart' is closed: its device was unplugged" in err
     assert tap.returncode != 0
+
+
+def test_a_router_and_a_simulated_board_on_one_machine(tmp_path: Path) -> None:
+    """The board sends and obeys, and halts when the commands stop. What the router receives can be recorded."""
+    (tmp_path / "table.yaml").write_text(f"""\
+version: 1
+envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
+listen:
+  rover: {{address: "127.0.0.1:{free_port()}"}}
+  uart: {{serial: {tmp_path}/uart, baud: 460800, framing: {{length: u16be}}, checksum: crc32}}
+endpoints:
+  operator: {{address: "127.0.6.10:{free_port("127.0.6.10")}", kind: tool}}
+  lander: {{listener: uart, kind: board}}
+routes:
+  ph_info: {{source: lander, destinations: [operator]}}
+  manual_drive:
+    source: operator
+    destinations: [lander]
+    deadman: {{timeout: 200ms, repeat: 50ms, send: {{manual_brake: {{brake: true}}}}, to: [lander]}}
+""")
+    program = check_table(tmp_path / "table.yaml", {}).program
+    assert program is not None
+    wire, silence = Wire(program.envelopes), parse_silence("operator:2-30")
+    simulator = Simulator(wire, program.table, 1, deadmen=program.deadmen, silences=[silence])
+    inboxes, mirrored = simulator.statistics.inboxes, list[Mirrored]()
+
+    def look(_: float) -> None:
+        states = [change.state for change in simulator.statistics.changes]
+        if inboxes["operator"].arrivals and State.OBEYING in states and states[-1] is State.HALTED:
+            simulator.stop()
+
+    with closing(simulator), Router(program) as router:
+        detach = router.mirror.attach(mirrored.extend)
+        assert simulator.run(20, 0.05, look) < 20
+        detach()
+    assert ("uart", "lander") in {
+        (datagram.listener, datagram.endpoint) for datagram in map(MirroredDatagram._make, mirrored)
+    }
+    assert inboxes["lander"].undecodable == 0
