@@ -237,19 +237,17 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
             yield Diagnostic(endpoint.span, Code.EMPTY_FIELD, what, hint)
 
 
-def _unused_sets(lookup: Lookup, routes: Sequence[CheckedRoute]) -> Iterator[Diagnostic]:
-    """Yield findings for `set` of endpoints for which the router makes no envelopes."""
+def _unused_sets(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Diagnostic]:
+    """Yield findings for `set` of endpoints for which the router makes no envelopes, unless something may be missing."""
+    if lookup.table.broken or _has_errors(lookup.findings):
+        return
     made = {name for checked in routes for name in _made_for(checked)}
-    sound = {checked.route.name for checked in routes if checked.deadman is not None}
-    for route in lookup.table.routes:
-        if route.is_outbound or (route.deadman is not None and route.name not in sound):  # it may have findings
-            made |= {destination.endpoint.value for destination in route.destinations}
+    made |= {service.request.to.value for service in lookup.table.services.values()}
     for endpoint in lookup.table.endpoints.values():
-        name, written = endpoint.name, endpoint.beside
-        if written is not None and name in lookup.beside and name not in made and not lookup.table.broken:
-            what = f"'set' of '{name}' fills nothing: no route from ROS and no deadman sends to it"
+        if endpoint.beside is not None and endpoint.name not in made:
+            what = f"'set' of '{endpoint.name}' fills nothing: the router makes no message for it"
             hint = "remove 'set'; what is forwarded keeps its own fields"
-            yield Diagnostic(written.span, Code.UNUSED_SET, what, hint)
+            yield Diagnostic(endpoint.beside.span, Code.UNUSED_SET, what, hint)
 
 
 def _made_for(checked: CheckedRoute) -> Iterator[str]:

@@ -111,7 +111,7 @@ def test_set_fills_what_the_envelope_requires_for_its_endpoint_only(tmp_path: Pa
     [
         ("{source: base, destinations: board, deadman: {none: it is a test}}", ["board", "base"]),
         ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {drive: {}}}}", ["base"]),
-        ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {driv: {}}}}", ["base"]),
+        ("{source: base, destinations: board, ttl: 1s, deadman: {timeout: 1s, send: {driv: {}}}}", []),  # an error
         (f"{{{SPEED}, destinations: [board, base], deadman: {{none: it is a test}}}}", []),
         (f"{{source: board, destinations: base, {TO_BASE}}}", ["board"]),
     ],
@@ -123,7 +123,7 @@ def test_set_is_unused_where_the_router_only_forwards(tmp_path: Path, drive: str
         text = text.replace(end, f"{end}, set: {{sequence: 7}}")
     table.write_text(text)
     found = [each.message for each in check_table(table, {}).diagnostics if each.code is Code.UNUSED_SET]
-    message = "'set' of '{}' fills nothing: no route from ROS and no deadman sends to it"
+    message = "'set' of '{}' fills nothing: the router makes no message for it"
     assert found == [message.format(name) for name in unused]
 
 
