@@ -238,7 +238,7 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
 
 
 def _unused_sets(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Diagnostic]:
-    """Yield findings for `set` of endpoints for which the router makes no envelopes, unless something may be missing."""
+    """Yield findings for `set` of endpoints for which the router makes no envelopes, unless the table has errors."""
     if lookup.table.broken or _has_errors(lookup.findings):
         return
     made = {name for checked in routes for name in _made_for(checked)}
