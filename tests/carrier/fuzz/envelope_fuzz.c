@@ -1,4 +1,5 @@
-/* A libFuzzer target: `envelope_read` reads and writes only what it may, and returns only what envelope.h says.
+/* A libFuzzer target: `envelope_read` and `envelope_part` read and write only what they may, and return only what envelope.h
+ * says.
  *
  * An input is a datagram. Each is read by all schemas, by a listener that repairs and by one that does not. */
 #include <stdlib.h>
@@ -21,6 +22,35 @@ static void check_envelope(const struct envelope *envelope, const uint8_t *data,
     if (envelope->is_single) demand(envelope->start + envelope->length <= envelope->size);
 }
 
+/* A part is an envelope with this message only. */
+static void check_part(const struct wire_schema *schema, uint8_t *part, const struct envelope *found) {
+    struct envelope again;
+    demand(envelope_read(schema, part, found->size, false, &again) == -1);
+    demand(again.case_number == found->case_number && again.size == found->size && again.others == 0);
+    demand(again.start == found->start && again.length == found->length && again.is_single == found->is_single);
+    demand(found->start + found->length <= found->size && found->others == 0);
+}
+
+/* Together the parts have each message once, and each of them what is beside the messages. */
+static void check_parts(const struct wire_schema *schema, const uint8_t *data, const struct envelope *whole) {
+    struct bytes frame = {data, data + whole->size};
+    uint8_t *part = malloc(whole->size); /* of its own length, so that the sanitizer sees what is written behind it */
+    if (part == NULL) return;
+    struct envelope found;
+    uint32_t count = 0, after = 0;
+    size_t sizes = 0;
+    for (; envelope_part(schema, frame, after, part, &found); after = found.case_number) {
+        demand(found.case_number > after && found.size <= whole->size);
+        note_outcome(part, found.size);
+        check_part(schema, part, &found);
+        sizes += found.size;
+        count++;
+    }
+    demand(count > 0 && (count == 1) == (whole->others == 0));
+    demand(count == 1 ? sizes == whole->size : sizes >= whole->size && (sizes - whole->size) % (count - 1) == 0);
+    free(part);
+}
+
 /* `data` has room for MAX_DATAGRAM bytes where `repairs`, else for `size` bytes. */
 static void check(const struct wire_schema *schema, uint8_t *data, const uint8_t *sent, size_t size, bool repairs) {
     struct envelope envelope;
@@ -35,6 +65,7 @@ static void check(const struct wire_schema *schema, uint8_t *data, const uint8_t
         check_envelope(&envelope, data, sent, size);
         uint32_t found[] = {envelope.case_number, envelope.start, envelope.length, envelope.size, envelope.is_single};
         note_outcome(found, sizeof found);
+        if (schema->case_by == BY_CASES) check_parts(schema, data, &envelope);
     } else {
         demand(!envelope.is_single);
     }
