@@ -203,8 +203,10 @@ static bool is_in_order(struct routing *routing, const struct route *route, cons
 
 /* ---- senders and payload cases ---- */
 
-/* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. */
-static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
+/* Return the sending endpoint, or NULL for a stranger. An endpoint with a port has priority over one without. It is inlined, as
+ * each datagram needs it. */
+static inline __attribute__((always_inline)) const struct peer *find_peer(const struct listener *listener, uint32_t address,
+                                                                          uint32_t port) {
     uint32_t low = 0, high = listener->peer_count;
     while (low < high) {
         uint32_t middle = (low + high) / 2;
@@ -368,11 +370,12 @@ int route_datagram(struct routing *routing, struct received *received) {
     received->times = freshness_times(&routing->freshness, arrived_at, received->received_at, received->now, INT64_MIN);
     env_count(&routing->env, listener->received, 1);
     env_count(&routing->env, listener->received_bytes, (int64_t)received->length);
-    received->peer = find_peer(listener, received->address, received->port);
-    if (!received->peer && listener->learned_count) received->peer = find_learned(routing, received);
-    received->column = received->peer ? received->peer->column : listener->columns - 1;
+    const struct peer *peer = find_peer(listener, received->address, received->port);
+    if (!peer && listener->learned_count) peer = find_learned(routing, received);
+    received->peer = peer;
+    received->column = peer ? peer->column : listener->columns - 1;
     received->route = NULL;
-    if (received->peer) hear(routing, received);
+    if (peer) hear(routing, received);
     const struct protocol *protocol = listener->protocol;
     int reason = envelope_read(&protocol->schema, routing->datagram, received->length, listener->repairs,
                                &received->envelope);
