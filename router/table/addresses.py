@@ -87,7 +87,7 @@ def parse_address(text: str) -> Address:
     if not host:
         raise BadAddressError(f"'{text}' has no IP address")
     if ":" in host:
-        raise BadAddressError(f"'{host}' is not an IPv4 address")
+        raise BadAddressError(f"'{host}' is not an IPv4 address", f"{_EXAMPLE}: IPv6 is not supported")
     if not _is_ipv4(host):
         raise _bad_host(host)
     if not re.fullmatch("[0-9]{1,5}", port) or not 1 <= int(port) <= 65535 or port[0] == "0":
