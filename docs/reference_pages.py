@@ -31,8 +31,10 @@ TABLE = (
     Section("Foxglove", "foxglove", "properties.foxglove"),
     Section("Reload", "reload", "properties.reload"),
     Section("Defaults", "defaults", "definitions.defaults"),
-    Section("Listeners", "listen.NAME", "definitions.listener.else"),
-    Section("Serial lines", "listen.NAME", "definitions.listener.then"),
+    Section("Listeners", "listen.NAME", "definitions.socket"),
+    Section("Serial lines", "listen.NAME", "definitions.serial_line"),
+    Section("TCP clients", "listen.NAME", "definitions.tcp_client"),
+    Section("TCP servers", "listen.NAME", "definitions.tcp_server"),
     Section("Framing", "listen.NAME.framing", "definitions.stream_framing.else"),
     Section("Checksum", "listen.NAME.checksum", "definitions.checksum.else"),
     Section("Endpoints", "endpoints.NAME", "definitions.endpoint"),
@@ -87,7 +89,7 @@ UNITS = {
     "list_expression": "expression",
     "condition": "expression",
     "locator": "locator",
-    "listener": "[listener](#listeners) or [serial line](#serial-lines)",
+    "listener": "[UDP](#listeners), [serial line](#serial-lines), [TCP client](#tcp-clients) or [server](#tcp-servers)",
     "device": "path",
     "stream_framing": "`cobs`, `slip`, `hdlc`, `varint` or [framing](#framing)",
     "checksum": "name or [checksum](#checksum)",
@@ -231,8 +233,11 @@ class SchemaPage:
         for key in ("envelope", "http", "record", "foxglove"):
             yield f"properties.{key}", rules[key]["required"]
         listener = rules["listen"]["additionalProperties"]
-        yield "definitions.listener", [*listener["if"]["required"], *listener["then"]["required"]]
-        yield "definitions.listener.else", listener["else"]["required"]
+        tcp = listener["else"]
+        yield "definitions.serial_line", [*listener["if"]["required"], *listener["then"]["required"]]
+        yield "definitions.tcp_client", ["connect", *tcp["then"]["required"]]
+        yield "definitions.tcp_server", ["accept", *tcp["then"]["required"]]
+        yield "definitions.socket", tcp["else"]["required"]
         yield "definitions.endpoint", rules["endpoints"]["additionalProperties"]["required"]
         yield "definitions.state", rules["state"]["additionalProperties"]["required"]
         service = rules["services"]["additionalProperties"]

@@ -36,7 +36,7 @@ from router.observe.running import ReloadResult, Running
 from router.observe.snapshot import SERIES, Snapshot
 from router.recording.mirror import Mirror
 from router.startup_image.head_start import HeadStart
-from router.table.addresses import Address, SerialPlace
+from router.table.addresses import Address, LinkPlace
 from router.table.model.settings import HOW_TO_KEEP
 from router.threads import DaemonThread, StopStack, background_threads
 
@@ -148,7 +148,7 @@ class Router:
         """Return the UDP address of an endpoint."""
         endpoint = self.program.table.endpoints.get(name)
         address = endpoint.address.value if endpoint is not None else None
-        return None if isinstance(address, SerialPlace) else address
+        return None if isinstance(address, LinkPlace) else address
 
     @property
     def program(self) -> CompiledTable:

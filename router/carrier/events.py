@@ -76,9 +76,9 @@ class StateChange:
 
 @dataclass(frozen=True, slots=True)
 class LinkChange:
-    """A link was opened (`error` is 0), was closed, or cannot be opened (errno)."""
+    """The link to an endpoint was opened (`error` is 0), was closed, or cannot be opened (errno)."""
 
-    listener: str
+    endpoint: str
     error: int
 
 
@@ -147,7 +147,7 @@ class EventReader:
             return StateChange(self._name(changed.state), was, became, source)
         if kind == EventKind.LINK:
             link = LinkEvent.from_buffer(record)
-            return LinkChange(self._name(link.listener), link.error)
+            return LinkChange(self._name(link.endpoint), link.error)
         event = DeadmanEvent.from_buffer(record)
         route = self._name(event.deadman)
         if kind != EventKind.DEADMAN_ERROR:
@@ -169,13 +169,14 @@ class EventReader:
         event, begin = DatagramEvent.from_buffer(record), ctypes.sizeof(DatagramEvent)
         place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
         host = inet_ntoa(event.address.to_bytes(4, "big"))
-        sender = f"from {host}:{event.port}" if event.port else "from the serial line"
+        port = f":{event.port}" if event.port else ""
+        sender = f"from {host}{port}" if event.address else "from the serial line"
         if event.kind == EventKind.SUPERSEDED:
             detail = f"{sender}: {self._superseded(place, data)}"
             return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))
         what = self._why_rejected(place, data, event.length)
         detail = sender + (f": {what}" if what else "")
-        mismatch = Mismatch(place, host, what) if event.reason in _MISMATCHES else None
+        mismatch = Mismatch(place, host, what) if event.reason in _MISMATCHES and event.length else None
         report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
         return CountedReport(event.counter, report)
 
@@ -198,8 +199,9 @@ class EventThread:
 
     Of many losses of a kind, only a few are written as events, but `report` gets their full number from the counter
     that the event names. `returned` gets an endpoint that is heard again, and how long it was silent (s), `learned` one
-    whose address was learned, with the address before and now, `link_changed` a link and why it is closed (errno; 0: it
-    is open), `state_changed` a state that has changed, `replied` a reply for a service, `of_deadmen` everything else.
+    whose address was learned, with the address before and now, `link_changed` an endpoint and why the link to it is
+    closed (errno; 0: it is open), `state_changed` a state that has changed, `replied` a reply for a service,
+    `of_deadmen` everything else.
     """
 
     def __init__(
@@ -274,8 +276,8 @@ class EventThread:
                 self._learned(endpoint, before, after)
             case StateChange() as change:
                 self._state_changed(change)
-            case LinkChange(listener, error):
-                self._link_changed(listener, error)
+            case LinkChange(endpoint, error):
+                self._link_changed(endpoint, error)
             case Reply() as reply:
                 self._replied(reply)
             case CountedReport(counter, report):

@@ -79,8 +79,9 @@ class LoadedImage:
         self._before = before._opened if before is not None else {}
         self._places = {image.symbols[number]: words for number, words in image.imports}
         self._copy()
+        is_simulated = any(("sender", name) in self._objects for name, _ in image.link_ends)
         for opening in image.openings:
-            if not opening[-1]:
+            if not opening[-1] and not (is_simulated and opening[1] == "server_open"):
                 self._open(*opening)
         for symbol in self._places:
             self._set(symbol, self._address(symbol))
@@ -172,8 +173,10 @@ class LoadedImage:
                 structure.fd, structure.keeps_input = listeners[name].socket.fileno(), listeners[name].is_inherited
 
     def stop_links(self) -> None:
-        """Close the devices of links, after what was sent has left. Nothing can be sent through them afterwards."""
-        for endpoint, _ in self.image.line_ends:
+        """Close all links, after what was sent has left. Nothing can be sent through them afterwards."""
+        for name in self.image.servers:
+            self._library.server_stop(self._objects["server", name].address)
+        for endpoint, _ in self.image.link_ends:
             self._library.link_stop(self._objects["sender", endpoint].address)
 
     def forget_before(self) -> None:

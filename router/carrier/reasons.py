@@ -16,6 +16,8 @@ def why_rejected(program: CompiledTable, listener: str, data: bytes, length: int
     plan = program.table.listeners.get(listener)
     if plan is None:
         return ""
+    if plan.accepts and not length:
+        return f"a connection; no endpoint with `listener: {listener}` has this address"
     repairs = plan.framing is Framing.ZERO_TRIMMED
     return datagrams.why_rejected(program.envelopes.at(listener), data, length, repairs=repairs)
 

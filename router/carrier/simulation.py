@@ -93,7 +93,7 @@ class Simulation:
     def _loaded(self, program: CompiledTable, image: Image, before: LoadedImage | None) -> _Running:
         opened = self._opened
         senders = {name: opened.sender(name, address) for name, address, *_ in image.senders}
-        senders |= {name: opened.sender(name, (device, 0)) for name, device in image.line_ends}
+        senders |= {name: opened.sender(name, (place, 0)) for name, place in image.link_ends}
         loaded = LoadedImage(opened.library, image, senders, opened.timers, self._generation, before)
         loaded.bind_topics(dict.fromkeys((topic for topic, _ in image.topics), _TOPIC))
         return _Running(program, loaded)
@@ -245,7 +245,8 @@ class _Running:
 
     def __init__(self, program: CompiledTable, image: LoadedImage) -> None:
         self.program, self.image = program, image
-        self.listeners: Mapping[str, int] = {plan.name: number for number, plan in enumerate(program.listeners)}
+        plans = [*program.table.sockets, *(listener for listener, _ in program.links)]
+        self.listeners: Mapping[str, int] = {plan.name: number for number, plan in enumerate(plans)}
         routes = {topic: each for topic, each, _ in image.ros_routes()} | image.requests()
         self.topic_numbers: Mapping[str, int] = {topic: number for number, topic in enumerate(routes)}
         topics = [c.RosTopic(routes=each, route_count=len(each)) for each in routes.values()]

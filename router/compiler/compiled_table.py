@@ -12,7 +12,7 @@ from router.compiler.expressions.tree import STATE
 from router.compiler.metrics import Counters
 from router.declared import BesideEncoding, BesideValue
 from router.errors import SourceSpan
-from router.table.addresses import SerialPlace
+from router.table.addresses import LinkPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, Inbound
@@ -357,18 +357,19 @@ class CompiledTable:
     @property
     def listeners(self) -> tuple[Listener, ...]:
         """All listeners, first those that are sockets."""
-        return (*self.table.sockets, *self.table.lines)
+        return (*self.table.sockets, *self.table.links)
 
     @property
-    def line_ends(self) -> Mapping[str, Endpoint]:
-        """The endpoints at the other ends of serial lines, by listener."""
-        ends = {each.listener.value: each for each in self.table.endpoints.values() if each.listener is not None}
-        return {line.name: ends[line.name] for line in self.table.lines}
+    def links(self) -> tuple[tuple[Listener, Endpoint], ...]:
+        """The endpoints at the other ends of serial lines and TCP connections, with their listeners."""
+        endpoints = self.table.endpoints.values()
+        ends = [(each, each.listener.value) for each in endpoints if each.listener is not None]
+        return tuple((link, each) for link in self.table.links for each, name in ends if name == link.name)
 
     @property
     def udp_senders(self) -> tuple[Endpoint, ...]:
         """The endpoints that datagrams are sent to."""
-        return tuple(each for each in self.senders if not isinstance(each.address.value, SerialPlace))
+        return tuple(each for each in self.senders if not isinstance(each.address.value, LinkPlace))
 
     @property
     def routes(self) -> Iterator[RoutePlan]:

@@ -64,8 +64,8 @@ METRICS = (
         "Multicast groups that it has not joined: their network interface or a route to them is missing.",
     ),
     Metric("listener_waiting", "number", ("listener",), "1 while its address or network interface is missing."),
-    Metric("link_up", "number", ("listener",), "1 while the device of the serial line is open."),
-    Metric("link_openings", "counter", ("listener",), "How often the device of the serial line was opened."),
+    Metric("link_up", "number", ("endpoint",), "1 while the serial line or TCP connection to it is open."),
+    Metric("link_openings", "counter", ("endpoint",), "How often the serial line or TCP connection to it was opened."),
     Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were restored or removed."),
     Metric(
         "superseded_members",
@@ -261,8 +261,8 @@ REJECT_REASONS: Mapping[str, str] = {
     "unhandled": "a payload case without a route",
     "ignored": "a payload case that the table ignores",
     "source_mismatch": "from an address that is not a source of the route, or on the wrong listener",
-    "bad_frame": "bytes of a serial line that are no frame, or a frame that is too long",
-    "bad_checksum": "a frame of a serial line whose bytes were changed on the way",
+    "bad_frame": "bytes of a serial line or TCP connection that are no frame, or a frame that is too long",
+    "bad_checksum": "a frame whose bytes were changed on the way",
 }
 """Reasons why no route accepted a datagram or frame, with their meaning."""
 

@@ -10,7 +10,7 @@ from itertools import combinations, product
 from typing import TypeAlias
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
-from router.table.addresses import Address, SerialPlace
+from router.table.addresses import Address, LinkPlace, SerialPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import EPHEMERAL, Endpoint, EndpointKind, Listener
 from router.table.model.gateways import Gateway, Transport
@@ -47,7 +47,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     yield from _several_machines(table)
     yield from _learned_findings(table)
     yield from _listener_findings(table)
-    yield from _line_findings(table)
+    yield from _link_findings(table)
     for endpoint in table.endpoints.values():
         if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
             message = f"'{endpoint.name}' is not a board, so it receives NaN and infinity anyway"
@@ -65,6 +65,9 @@ def _local_addresses(table: RouteTable) -> Iterator[_LocalAddress]:
     for listener in table.sockets:
         interface = listener.interface
         yield _LocalAddress(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
+    for listener in table.links:
+        if listener.accepts:
+            yield _LocalAddress(f"listener '{listener.name}'", listener.address)
     if table.http is not None:
         yield _LocalAddress("'http'", table.http.address)
     if table.foxglove is not None:
@@ -186,39 +189,44 @@ def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
             yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
 
 
-def _line_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for serial lines that share a device, or do not have one endpoint at their other end."""
+def _link_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Yield findings for serial lines that share a device, and for links without the right endpoints."""
     devices: dict[Address, Listener] = {}
     for line in table.lines:
-        first = devices.setdefault(line.address.value, line)
-        if first is not line:
-            message = f"listener '{line.name}' uses the device of listener '{first.name}'"
-            yield Diagnostic(
-                line.address.span, Code.ADDRESS_CLASH, message, "name another device: only one of them can open it"
-            )
-        at_its_end = [each for each in table.endpoints.values() if _is_at(each, line)]
+        other = devices.setdefault(line.address.value, line)
+        if other is not line:
+            message = f"listener '{line.name}' uses the device of listener '{other.name}'"
+            hint = "name another device: only one of them can open it"
+            yield Diagnostic(line.address.span, Code.ADDRESS_CLASH, message, hint)
+    for listener in table.links:
+        assert listener.link is not None  # noqa: S101 - it is a link
+        noun, at_its_end = listener.link.NOUN, [each for each in table.endpoints.values() if _is_at(each, listener)]
         if not at_its_end and not table.broken:
-            message = f"nobody is at the other end of the serial line '{line.name}'"
-            hint = f"add an endpoint with `listener: {line.name}` and without 'address'"
-            yield Diagnostic(line.span, Code.MISSING_KEY, message, hint)
-        for other in at_its_end[1:]:
-            message = f"'{at_its_end[0].name}' and '{other.name}' are both at the other end of '{line.name}'"
-            yield Diagnostic(
-                other.span, Code.ADDRESS_CLASH, message, "a serial line has one endpoint: remove the other"
-            )
+            message = f"nobody is at the other end of the {noun} '{listener.name}'"
+            hint = f"add an endpoint with `listener: {listener.name}` and "
+            hint += "the IP address of its board" if listener.accepts else "without 'address'"
+            yield Diagnostic(listener.span, Code.MISSING_KEY, message, hint)
+        known: dict[str, Endpoint] = {}
+        for each in at_its_end:
+            if (first := known.setdefault(each.address.value.host, each)) is each:
+                continue
+            message = f"'{first.name}' and '{each.name}' are both at the other end of '{listener.name}'"
+            hint = f"a {noun} has one endpoint{' for each address' * listener.accepts}: remove the other"
+            yield Diagnostic(each.span, Code.ADDRESS_CLASH, message, hint)
     for endpoint in table.endpoints.values():
         yield from _misplaced(table, endpoint)
 
 
 def _misplaced(table: RouteTable, endpoint: Endpoint) -> Iterator[Diagnostic]:
-    """Yield findings for keys of an endpoint that are only for UDP or only for a serial line."""
-    lines = {line.name: line for line in table.lines}
-    if endpoint.send_from is not None and endpoint.send_from.value in lines:
-        message = f"'{endpoint.send_from.value}' is a serial line, so no UDP datagrams leave from it"
+    """Yield findings for keys of an endpoint that are only for UDP or only for a link."""
+    nouns = {listener.name: listener.link.NOUN for listener in table.links if listener.link is not None}
+    if endpoint.send_from is not None and endpoint.send_from.value in nouns:
+        noun = nouns[endpoint.send_from.value]
+        message = f"'{endpoint.send_from.value}' is a {noun}, so no UDP datagrams leave from it"
         yield Diagnostic(endpoint.send_from.span, Code.BAD_VALUE, message, "name a listener with an address")
-    if endpoint.listener is None or endpoint.listener.value not in lines:
+    if endpoint.listener is None or endpoint.listener.value not in nouns:
         return
-    is_udp = not isinstance(endpoint.address.value, SerialPlace)
+    is_udp = not _is_on_link(endpoint)
     spans = {
         "address": endpoint.address.span if is_udp else None,
         "source_port": endpoint.source_port.span if endpoint.source_port else None,
@@ -226,7 +234,8 @@ def _misplaced(table: RouteTable, endpoint: Endpoint) -> Iterator[Diagnostic]:
     }
     for key, span in spans.items():
         if span is not None:
-            message = f"'{endpoint.name}' is at the other end of the serial line '{endpoint.listener.value}'"
+            noun = nouns[endpoint.listener.value]
+            message = f"'{endpoint.name}' is at the other end of the {noun} '{endpoint.listener.value}'"
             yield Diagnostic(span, Code.BAD_VALUE, message, f"remove '{key}', which is for UDP")
 
 
@@ -238,7 +247,7 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
     """Return a finding if a received datagram could be from either endpoint."""
     if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
         return None
-    if isinstance(one.address.value, SerialPlace):  # which has a finding, also if neither sends
+    if _is_on_link(one) or _is_on_link(other):  # which have findings of their own
         return None
     if one.listener and other.listener and one.listener.value != other.listener.value:
         return None
@@ -294,7 +303,7 @@ def reaches(address: Address, own: Address) -> bool:
 
 def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
     """Return the listener whose address and port datagrams to an endpoint are sent from; None for a separate port. For
-    the other end of a serial line, return that line.
+    the other end of a link, return that listener.
 
     Listeners that differ only in their interfaces share one address and port.
     """
@@ -310,11 +319,17 @@ ON_LINE = WILDCARD, 0
 """The address that a frame of a serial line counts as coming from."""
 
 
+def _is_on_link(endpoint: Endpoint) -> bool:
+    return isinstance(endpoint.address.value, LinkPlace)
+
+
 def sent_by(endpoint: Endpoint) -> tuple[str, int]:
-    """Return the address that datagrams of an endpoint come from; on a serial line, ON_LINE."""
+    """Return the address that datagrams of an endpoint come from. On a serial line, it is ON_LINE; over TCP, the port
+    is 0.
+    """
     address = endpoint.address.value
-    if isinstance(address, SerialPlace):
-        return ON_LINE
+    if isinstance(address, LinkPlace):
+        return ON_LINE if isinstance(address, SerialPlace) else (address.host, 0)
     return address.host, endpoint.source_port.value if endpoint.source_port else address.port
 
 
@@ -352,14 +367,17 @@ def recognisers(
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
-    Endpoints of other listeners are omitted, unless `listener` is None, and those whose address is not known. An
+    Endpoints of other listeners are omitted, or of all links if `listener` is None, and those whose address is not
+    known; without a listener of their own, endpoints are recognised by all UDP sockets. An
     IP address that several endpoints share without source ports identifies none of them; this is only valid if none is
     a source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}
+    links = {each.listener.value for each in endpoints.values() if each.listener and _is_on_link(each)}
     for endpoint in endpoints.values():
-        if listener is not None and endpoint.listener is not None and endpoint.listener.value != listener:
+        own = endpoint.listener.value if endpoint.listener is not None else None
+        if own != listener and (listener in links or own in links or None not in (own, listener)):
             continue
         if endpoint.address.value.is_name or endpoint.address.value.is_learned:
             continue

@@ -32,6 +32,7 @@ from router.compiler.metrics import (
     Counters,
 )
 from router.compiler.resolution import unresolved
+from router.table.addresses import LinkPlace
 from router.table.model import RouteTable
 from router.table.model.routes import ROS
 from router.types.table_envelopes import Envelopes
@@ -79,14 +80,17 @@ def _open_listeners(counters: Counters, table: RouteTable, envelopes: Envelopes)
             ),
             listener,
         )
-        is_line = table.listeners[listener].line is not None
-        _open(counters, ("link_up", "link_openings") if is_line else ("kernel_drops", "listener_waiting"), listener)
+        if table.listeners[listener].link is None:
+            _open(counters, ("kernel_drops", "listener_waiting"), listener)
         if table.listeners[listener].groups:
             _open(counters, ("groups_not_joined",), listener)
         _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
     _open_each(counters, "unhandled", last=(*envelopes.numbers, UNKNOWN_CASE))
     for metric in ENDPOINT_METRICS:
         _open_each(counters, metric, last=table.endpoints)
+    for endpoint in table.endpoints.values():
+        if isinstance(endpoint.address.value, LinkPlace):
+            _open(counters, ("link_up", "link_openings"), endpoint.name)
     _open_each(counters, "endpoint_unresolved", last=unresolved(table))
     learned = (each.name for each in table.endpoints.values() if each.address.value.is_learned)
     _open_each(counters, "endpoint_learned", last=learned)

@@ -6,7 +6,7 @@ that it depends on, besides its arguments.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import astuple, dataclass, field
 from math import ceil
 from typing import TYPE_CHECKING, Any
@@ -17,13 +17,20 @@ from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, R
 from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
-from router.table.model.endpoints import Listener
+from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.serial import LENGTHS, SerialLine
+from router.table.model.tcp import TcpClient, TcpServer
 
 if TYPE_CHECKING:
     from router.image.image import Symbol
 
 _NS = 1_000_000_000
+_PATIENCE_MS = 2000
+_MEDIA: Mapping[type, c.Medium] = {
+    SerialLine: c.Medium.SERIAL,
+    TcpClient: c.Medium.CLIENT,
+    TcpServer: c.Medium.SERVER,
+}
 
 
 def period(hertz: float) -> int:
@@ -31,9 +38,9 @@ def period(hertz: float) -> int:
     return ceil(_NS / hertz)
 
 
-def framing_of(line: SerialLine) -> c.Framing:
-    """Return the framing and checksum of a line, as the carrier executes them."""
-    framing, checksum = line.framing, line.checksum
+def framing_of(link: SerialLine | TcpClient | TcpServer) -> c.Framing:
+    """Return the framing and checksum of a link, as the carrier executes them."""
+    framing, checksum = link.framing, link.checksum
     kind = f"LENGTH_{framing.kind}" if framing.kind in LENGTHS else framing.kind
     of = "CRC32" if framing.kind == "hdlc" else checksum.kind.name if checksum is not None else "NONE"
     is_big_endian = checksum is not None and checksum.is_big_endian
@@ -64,27 +71,45 @@ class Openings:
 
     # links
 
-    def link(self, listener: Listener) -> int:
-        """Open the link of a serial line. It is the sender of the endpoint at the other end."""
-        line = listener.line
-        assert line is not None  # noqa: S101 - checked by the caller
-        framing = framing_of(line)
+    def link(self, listener: Listener, endpoint: Endpoint) -> int:
+        """Open the link to an endpoint at a serial line or TCP connection. It is the sender of the endpoint."""
+        link, counters, address = listener.link, self.program.counters, endpoint.address.value
+        assert link is not None  # noqa: S101 - checked by the caller
+        is_line = isinstance(link, SerialLine)
+        settings = c.LinkSettings(
+            framing=framing_of(link),
+            medium=_MEDIA[type(link)],
+            host=0 if is_line else host_number(address.host),
+            port=address.port,
+            patience=self._patience(endpoint.name),
+            endpoint=self.names.number(endpoint.name),
+            up=counters.index("link_up", endpoint.name),
+            openings=counters.index("link_openings", endpoint.name),
+        )
+        if isinstance(link, SerialLine):
+            settings.line = c.Serial(link.baud, int(c.Parity[link.parity.name]), link.stop_bits)
         return self._open(
-            ("sender", self.program.line_ends[listener.name].name),
+            ("sender", endpoint.name),
             "link_open",
             self._argument("timers"),
-            line.serial.value.encode(),
-            line.baud,
-            int(c.Parity[line.parity.name]),
-            line.stop_bits,
-            framing.kind,
-            framing.checksum,
-            bool(framing.is_big_endian),
-            framing.address,
-            self.names.number(listener.name),
-            self.program.counters.index("link_up", listener.name),
-            self.program.counters.index("link_openings", listener.name),
+            bytes(settings),
+            link.serial.value.encode() if isinstance(link, SerialLine) else b"",
+            self._server(listener) if isinstance(link, TcpServer) else None,
         )
+
+    def _server(self, listener: Listener) -> tuple[int]:
+        """Open the TCP server of a listener."""
+        host, port = listener.address.value
+        refused = self.program.counters.index("datagrams_rejected", listener.name, "source_mismatch")
+        of = self.names.number(listener.name), refused
+        symbol = "server", listener.name
+        self._open(symbol, "server_open", self._argument("timers"), host_number(host), port, *of)
+        return self._argument(*symbol)
+
+    def _patience(self, endpoint: str) -> int:
+        """Return how long bytes to an endpoint may be unacknowledged (ms): less than its shortest deadman."""
+        deadmen = [plan.timeout for plan in self.program.deadmen if endpoint in dict(plan.datagrams)]
+        return min([_PATIENCE_MS, *(timeout * 3 // 4 // 1_000_000 for timeout in deadmen)])
 
     # targets
 
@@ -172,6 +197,11 @@ class Openings:
             if target.label == endpoint and target.is_deferred and not target.is_topic
             for source in sources_of(plan)
         ]
+
+
+def host_number(host: str) -> int:
+    """Return an IPv4 address as a number."""
+    return int.from_bytes(bytes(map(int, host.split("."))), "big")
 
 
 def sources_of(plan: RoutePlan) -> Collection[str | None]:

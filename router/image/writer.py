@@ -21,7 +21,7 @@ from router.image.boards import write_boards
 from router.image.image import Image
 from router.image.memory import Memory, Symbols, address_in
 from router.image.names import Names
-from router.image.openings import Openings
+from router.image.openings import Openings, host_number
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
 from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing, Listener
@@ -32,8 +32,8 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     """Write the image of a table. It adds to `names`, the names of the process. Equal tables have equal images."""
     names, arrays = names or Names(), Arrays()
     openings = Openings(program, names)
-    for line in program.table.lines:
-        openings.link(line)
+    for listener, endpoint in program.links:
+        openings.link(listener, endpoint)
     for deadman in program.deadmen:
         openings.deadman(deadman)
     pacers = [Timer(each) for each in openings.pacers()]
@@ -67,7 +67,8 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
             (each.name, *destination(program.table, each), sent_from(program.table, each))
             for each in program.udp_senders
         ],
-        line_ends=[(each.name, each.address.value.host) for each in program.line_ends.values()],
+        link_ends=[(each.name, str(each.address.value)) for _, each in program.links],
+        servers=[each.name for each in program.table.links if each.accepts],
         topics=[(each.label, each.qos.serves_late_joiners) for each in program.publishers],
         openings=[*openings.listed.values()],
         timers=[_timer(each, memory) for each in (*pacers, *targets.timers)],
@@ -121,7 +122,8 @@ class _Writer:
         protocols = {
             name: ctypes.pointer(self._protocol(each)) for name, each in self.program.envelopes.by_name.items()
         }
-        listeners = [self._listener(each, protocols) for each in self.program.listeners]
+        listeners = [self._listener(each, None, protocols) for each in self.program.table.sockets]
+        listeners += [self._listener(each, end, protocols) for each, end in self.program.links]
         return c.Program(
             listener_count=len(listeners),
             state_count=len(self.program.states),
@@ -155,15 +157,20 @@ class _Writer:
             for number, name in members
         ]
 
-    def _listener(self, plan: Listener, protocols: Mapping[str, ctypes._Pointer[c.Protocol]]) -> c.Listener:
-        """Write a listener, without its socket. `protocols` are by the name of the envelope."""
+    def _listener(
+        self, plan: Listener, end: Endpoint | None, protocols: Mapping[str, ctypes._Pointer[c.Protocol]]
+    ) -> c.Listener:
+        """Write a socket, which is opened later, or the link to the endpoint `end`.
+
+        `protocols` are by the name of the envelope.
+        """
         counters, name = self.counters, plan.name
         peers, learned = list(self._peers(name)), list(self._learned(name))
         return c.Listener(
             fd=-1,
             id=self.targets.openings.names.number(name),
             repairs=plan.framing is Framing.ZERO_TRIMMED,
-            link=self.targets.openings.link(plan) if plan.line is not None else None,
+            link=self.targets.openings.link(plan, end) if end is not None else None,
             protocol=protocols[self.program.envelopes.listeners[name]],
             peers=self.arrays.array(c.Peer, peers),
             learned=self.arrays.array(c.LearnedPeer, learned),
@@ -183,7 +190,7 @@ class _Writer:
         by_host, by_address = recognisers(self.program.table.endpoints, listener)
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
-        for address, _, port, name in sorted((_number(host), not port, port, name) for host, port, name in known):
+        for address, _, port, name in sorted((host_number(host), not port, port, name) for host, port, name in known):
             peer = self._peer(name)
             peer.address, peer.port = address, port
             yield peer
@@ -297,10 +304,6 @@ class _Writer:
             deadman_id=openings.names.number(deadman.route),
             endpoint_id=openings.names.number(endpoint),
         )
-
-
-def _number(host: str) -> int:
-    return int.from_bytes(bytes(map(int, host.split("."))), "big")
 
 
 def _ros_routes(writer: TargetWriter, topic: str, feeds: tuple[LoweredFeed, ...]) -> ctypes.Array[c.RosRoute]:

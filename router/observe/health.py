@@ -157,6 +157,7 @@ _ON_LINE: Mapping[str, str] = {
     ),
 }
 """Remedies for messages to the other end of a serial line that are dropped, by reason."""
+_CLOSED_CONNECTION = "Check power and network of {endpoint}, and whether its program runs; the log says why."
 _ALL_SILENT = "All endpoints are silent: check this computer's network: cable, switch, radio."
 
 
@@ -459,7 +460,9 @@ class HealthSnapshot:
     def _closed(self) -> Iterator[Problem]:
         for (name,), is_up in self.now.counts(Kind.LINK_CLOSED.metric).items():
             if not is_up:
-                yield self._problem(Kind.LINK_CLOSED, {"listener": name})
+                closed = self._problem(Kind.LINK_CLOSED, {"endpoint": name})
+                remedy = closed.remedy if self._is_on_line(name) else _CLOSED_CONNECTION.format(endpoint=name)
+                yield closed._replace(remedy=remedy)
 
     def _burst(self) -> Iterator[Problem]:
         """Yield routes whose commands may have been stored on their way."""

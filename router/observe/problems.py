@@ -68,7 +68,7 @@ class Kind(enum.Enum):
     )
     LINK_CLOSED = (
         Level.CRITICAL,
-        "the serial line {listener} is closed: nothing is received or sent",
+        "the link to {endpoint} is closed: nothing is received or sent",
         "Check plug and power, and who has {address}: `ls -lL {address}`, `fuser -v {address}`; the log says why.",
         "link_up",
     )

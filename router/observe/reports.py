@@ -11,7 +11,7 @@ from router.clock import boottime_ns
 from router.compiler.compiled_table import DeadmanPlan
 from router.compiler.metrics import UNSENT_REASONS, Mismatch, Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, fault, logger
-from router.net.serial import why_closed
+from router.net.links import why_closed
 from router.net.udp import why_not_sent
 from router.table.addresses import Address, parse_address
 from router.threads import Thread, join_or_abandon
@@ -144,16 +144,15 @@ class Reporter:
         else:
             logger.info("address learned", endpoint=endpoint, address=after)
 
-    def link_changed(self, listener: str, error: int) -> None:
-        """Log that a serial line was opened (`error` is 0), was closed, or cannot be opened (errno)."""
+    def link_changed(self, endpoint: str, error: int) -> None:
+        """Log that the link to an endpoint was opened (`error` is 0), was closed, or cannot be opened (errno)."""
         if not error:
-            what = "the serial line is open"
-            self._floods.note(("link opened", listener), logger.info, what, listener=listener)
+            self._floods.note(("link opened", endpoint), logger.info, "the link is open", endpoint=endpoint)
             return
         why, remedy = why_closed(error)
-        what = "the serial line is closed; nothing is received or sent, and the router retries each second"
+        what = "the link is closed; nothing is received or sent until it is open again"
         self._floods.note(
-            ("link closed", listener, error), logger.warning, what, listener=listener, why=why, remedy=remedy
+            ("link closed", endpoint, error), logger.warning, what, endpoint=endpoint, why=why, remedy=remedy
         )
 
     def _lost_for(self, plan: DeadmanPlan | None) -> Report | None:

@@ -46,12 +46,23 @@ class Address(NamedTuple):
 LEARNED = Address("learned", 0)
 
 
-class SerialPlace(Address):
-    """The other end of a serial line, in the place of an address: `host` is the device."""
+class LinkPlace(Address):
+    """The other end of a link, in the place of an address."""
 
     @property
     def is_name(self) -> bool:
         return False
+
+
+class TcpPlace(LinkPlace):
+    """The other end of a TCP connection; its port is 0 if it connects to the router."""
+
+    def __str__(self) -> str:
+        return f"tcp {self.host}:{self.port}" if self.port else f"tcp {self.host}"
+
+
+class SerialPlace(LinkPlace):
+    """The other end of a serial line: `host` is the device."""
 
     def __str__(self) -> str:
         return self.host
@@ -83,7 +94,7 @@ def parse_address(text: str) -> Address:
     """Parse an address. Raises BadAddressError."""
     host, colon, port = text.rpartition(":")
     if not colon or _is_ipv4(port):
-        raise BadAddressError(f"'{text}' has no port")
+        raise no_port(text)
     if not host:
         raise BadAddressError(f"'{text}' has no IP address")
     if ":" in host:
@@ -95,6 +106,10 @@ def parse_address(text: str) -> Address:
     return Address(host, int(port))
 
 
+def no_port(text: str) -> BadAddressError:
+    return BadAddressError(f"'{text}' has no port")
+
+
 def parse_remote(text: str) -> Address:
     """Parse the address of a single machine, as a destination. Raises BadAddressError."""
     address = parse_address(text)
@@ -104,9 +119,14 @@ def parse_remote(text: str) -> Address:
 
 
 def parse_endpoint(text: str) -> Address:
-    """Parse the address of a single machine, its host name and a port, or `learned`. Raises BadAddressError."""
+    """Parse the address of a single machine, its host name and a port, or `learned`. Raises BadAddressError.
+
+    An IP address without a port is a TcpPlace.
+    """
     if text == LEARNED.host:
         return LEARNED
+    if _is_ipv4(text):
+        return TcpPlace(parse_remote(f"{text}:1").host, 0)
     host, _, port = text.rpartition(":")
     if NAME.fullmatch(host) and len(host) <= _LONGEST_NAME:
         return Address(host.lower(), parse_address(f"127.0.0.1:{port}").port)
@@ -181,7 +201,7 @@ def _bad_host(host: str) -> BadAddressError:
 ADDRESSES: tuple[Path, ...] = (
     ("http", "address"),
     ("foxglove", "address"),
-    ("listen", "*", "address"),
+    *(("listen", "*", name) for name in ("address", "connect", "accept")),
     ("listen", "*", "groups", "*"),
     *(("endpoints", "*", name) for name in ("address", "group", "broadcast")),
     ("gateways", "*", "receive"),
@@ -214,14 +234,14 @@ def _found(node: Node, pattern: Path, here: Path) -> Iterator[tuple[Path, Scalar
 
 
 def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool) -> Iterator[Diagnostic]:
-    is_locator = "zenoh" in path[3:]
+    is_locator, is_client = "zenoh" in path[3:], path[0] == "endpoints" and _is_ipv4(node.text)
     locator = LOCATOR.fullmatch(node.text) if is_locator else None
     name, key = ".".join(map(str, path[:-1])), path[-1]
     if key in ("group", "groups"):
         yield from _group_outside(f"'{key}' of {name}", node, networks)
         return
     try:
-        address = parse_address(locator["address"] if locator else node.text)
+        address = parse_address(locator["address"] if locator else f"{node.text}:1" if is_client else node.text)
     except BadAddressError:
         # A host name, IPv6, a path; invalid addresses of other kinds already have a finding.
         if is_locator or NAME.fullmatch(node.text.rpartition(":")[0]):
@@ -233,8 +253,9 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
     if any(host in network for network in networks.members):
         return
     which = "which includes more than" if address.host == "0.0.0.0" else "outside"
-    what = f"'{key}' of {name} is {address}, {which} {networks}"
-    nearest = f"{_moved(host, networks.members[0])}:{address.port}"
+    port = "" if is_client else f":{address.port}"
+    what = f"'{key}' of {name} is {address.host}{port}, {which} {networks}"
+    nearest = f"{_moved(host, networks.members[0])}{port}"
     example = f"{locator['protocol']}{nearest}{locator['rest']}" if locator else nearest
     yield Diagnostic(node.span, Code.OUTSIDE_NETWORKS, what, _remedy(path, example, networks, is_extended))
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar, Union
 from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
-from router.table.addresses import LOCAL, REMOTE, Address, SerialPlace
+from router.table.addresses import LOCAL, REMOTE, Address, LinkPlace, SerialPlace, TcpPlace, no_port
 from router.table.keys import Key, keys_of
 from router.table.model import Networks, RouteTable
 from router.table.model.endpoints import Endpoint, Framing, Listener
@@ -41,6 +41,7 @@ from router.table.model.services import CalledService, Service, ServiceRequest
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
 from router.table.model.targets import Destination, Topic
+from router.table.model.tcp import TcpClient, TcpServer
 from router.table.nodes import (
     EACH,
     ELSE,
@@ -243,31 +244,59 @@ def _scalar_value(key: Key, node: ScalarNode) -> object:
 
 def _listener(entry: Entry) -> Listener:
     name, span, settings = entry.key.text, entry.key.span, mapping(entry.value)
-    if "serial" not in settings.entries:
+    link: SerialLine | TcpClient | TcpServer
+    place: Located[Address]
+    if "serial" in settings.entries:
+        link = structure(SerialLine, settings, span=span)
+        place = Located(SerialPlace(link.serial.value, 0), link.serial.span)
+    elif "connect" in settings.entries:
+        link = structure(TcpClient, settings, span=span)
+        place = Located(TcpPlace(*link.connect.value), link.connect.span)
+    elif "accept" in settings.entries:
+        link = structure(TcpServer, settings, span=span)
+        place = Located(TcpPlace(*link.accept.value), link.accept.span)
+    else:
         return structure(Listener, settings, name=name, span=span)
-    line = structure(SerialLine, settings, span=span)
-    if line.framing.kind == "hdlc" and line.checksum is not None:
+    if link.framing.kind == "hdlc" and link.checksum is not None:
         where = settings.entries["checksum"].key.span
         raise InvalidValueError(where, Code.BAD_VALUE, "HDLC frames have a CRC-32 of their own", "remove 'checksum'")
-    address: Address = SerialPlace(line.serial.value, 0)
-    device = Located(address, line.serial.span)
-    return Listener(name, span, device, Framing.EXACT, line=line, envelope=line.envelope)
+    return Listener(name, span, place, Framing.EXACT, link=link, envelope=link.envelope)
 
 
 def _endpoint(entry: Entry, listeners: Mapping[str, Listener]) -> Endpoint:
-    """Build an endpoint. Without `address`, it is the other end of its listener, a serial line."""
+    """Build an endpoint. Without `address`, it is the other end of its listener, a serial line or a TCP client."""
     name, span, settings = entry.key.text, entry.key.span, mapping(entry.value)
     beside = settings.entries.get("set")
     given = {"name": name, "span": span, "beside": _constants(beside) if beside else None}
+    named = settings.get("listener")
+    known = listeners.get(located(named).value) if named is not None else None
     if settings.entries.keys() & {"address", "group", "broadcast"}:
-        return structure(Endpoint, settings, **given)
-    listener = located(settings.get("listener"))
-    known = listeners.get(listener.value)
-    if known is not None and known.line is None:
+        endpoint = structure(Endpoint, settings, **given)
+        _check_port(endpoint, known)
+        return endpoint
+    if known is not None and (known.link is None or known.accepts):
         what = f"endpoint '{name}' has no 'address'"
-        raise InvalidValueError(span, Code.MISSING_KEY, what, "write it: only the other end of a serial line has none")
-    place = known.address.value if known is not None else SerialPlace(listener.value, 0)  # which has a finding
+        hint = "write it: only the other end of a serial line or of `connect` has none"
+        if known.accepts:
+            hint = f"write the IP address that it connects to '{known.name}' from"
+        raise InvalidValueError(span, Code.MISSING_KEY, what, hint)
+    listener = located(named)
+    place = known.address.value if known is not None else LinkPlace(listener.value, 0)  # which has a finding
     return structure(Endpoint, settings, **given, unicast=Located(place, listener.span))
+
+
+def _check_port(endpoint: Endpoint, listener: Listener | None) -> None:
+    """Check that the address has a port, unless it is that of a client of the listener."""
+    address = endpoint.unicast
+    if address is None:
+        return
+    if listener is None or not listener.accepts:
+        if isinstance(address.value, TcpPlace):
+            error = no_port(address.value.host)
+            raise InvalidValueError(address.span, Code.BAD_ADDRESS, error.what, error.hint)
+    elif not isinstance(address.value, TcpPlace):
+        what = f"'{endpoint.name}' connects to '{listener.name}' from any port, but its address has one"
+        raise InvalidValueError(address.span, Code.BAD_ADDRESS, what, "write only its IP address")
 
 
 def _stream_framing(node: Node) -> StreamFraming:

@@ -194,14 +194,14 @@ def _owners(name: str, path: Path) -> str:
         for owner, schema in definitions.items()
         if name in keys_of(schema) and not owner.endswith(others) and not owner.startswith(("complete", "elements"))
     ]
-    if path and path[0] == "listen" and "listener" in owners:
-        return "remove it: a listener with 'address' and one with 'serial' have different keys"
+    if path and path[0] == "listen" and any(_NAMES[owner] == _NAMES["socket"] for owner in owners):
+        return "remove it: listeners with 'address', 'serial', 'connect' and 'accept' have different keys"
     if path[:1] != ("services",):
         owners = [owner for owner in owners if not owner.startswith(("service", "called"))]
     elif "service" in owners:
         return "remove it: a service that a board answers and one with 'call' have different keys"
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
-    named = [_NAMES[owner] for owner in near]
+    named = [*dict.fromkeys(_NAMES[owner] for owner in near)]
     named += ["the top level"] if name in keys_of(table_schema()) else []
     return f"move it to {', or to '.join(named)}" if named else ""
 
@@ -231,9 +231,9 @@ _NAMES = {
     "service_source": "'from'",
     "service_call": "'call'",
     "called_reply": "the 'reply' of a service",
-    "listener": "a listener",
-    "stream_framing": "'framing' of a serial line",
-    "checksum": "'checksum' of a serial line",
+    **dict.fromkeys(("socket", "serial_line", "tcp_client", "tcp_server"), "a listener"),
+    "stream_framing": "'framing' of a serial line or TCP connection",
+    "checksum": "'checksum' of a serial line or TCP connection",
     "endpoint": "an endpoint",
     "gateway": "a gateway",
     "transport": "'transport'",

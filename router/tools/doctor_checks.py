@@ -26,7 +26,7 @@ from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
 from router.net.udp import absence, why_no_way
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
-from router.table.addresses import LOCATOR, Address, BadAddressError, SerialPlace, parse_address
+from router.table.addresses import LOCATOR, Address, BadAddressError, LinkPlace, parse_address
 from router.table.model.endpoints import Endpoint, Listener, bound_to
 from router.table.model.gateways import Transport
 
@@ -226,6 +226,11 @@ def ports(program: CompiledTable, *, running: bool, with_listeners: bool = True)
     wanted += [("tcp", address.value, None, what, True) for address, what in _pages(program) if address is not None]
     gateways = [(protocol, address, None, what, protocol == "tcp") for protocol, address, what in _gateways(program)]
     wanted += gateways
+    wanted += [
+        ("tcp", Address(*listener.address.value), None, f"listener '{listener.name}'", True)
+        for listener in program.table.links
+        if listener.accepts
+    ]
     there = [listener for listener in program.table.sockets if _absence(listener) is None] if with_listeners else []
     wanted += [
         ("udp", listener.address.value, listener.interface, f"listener '{listener.name}'", bool(listener.groups))
@@ -368,7 +373,7 @@ def endpoints(program: CompiledTable, in_place_of: Mapping[str, str]) -> Iterato
 def _on_udp(program: CompiledTable) -> list[Endpoint]:
     """Return the endpoints that have an address."""
     endpoints = program.table.endpoints.values()
-    return [endpoint for endpoint in endpoints if not isinstance(endpoint.address.value, SerialPlace)]
+    return [endpoint for endpoint in endpoints if not isinstance(endpoint.address.value, LinkPlace)]
 
 
 def _has_way(endpoint: Endpoint) -> bool:

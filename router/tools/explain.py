@@ -528,7 +528,7 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
     }
     parts = {"table": _settings_lines(settings)}
     parts |= {
-        f"listener {name}": _settings_lines(listener.line or listener) for name, listener in table.listeners.items()
+        f"listener {name}": _settings_lines(listener.link or listener) for name, listener in table.listeners.items()
     }
     parts |= {f"endpoint {name}": _settings_lines(endpoint) for name, endpoint in table.endpoints.items()}
     for route in checked.routes:

@@ -16,7 +16,7 @@ from pathlib import Path
 from router.compiler.compiled_table import CompiledTable
 from router.errors import did_you_mean
 from router.net.kernel import processes_called
-from router.net.serial import device_holder, why_closed
+from router.net.links import device_holder, why_closed
 from router.tools.doctor_checks import CheckResult, fine, page, problem, warning
 
 BY_ID = Path("/dev/serial/by-id")

@@ -20,7 +20,7 @@ from router.clock import wall_ns
 from router.errors import TransportError, UsageError
 from router.image.openings import framing_of
 from router.library import library
-from router.net.serial import device_holder, why_closed
+from router.net.links import device_holder, why_closed
 from router.tools.tap import PATIENCE, TappedDatagram, local_time, tapped_datagram
 from router.tools.udp import Sent, paced
 
@@ -80,7 +80,7 @@ class LineEnd:
         except BlockingIOError:
             return []
         if not data:
-            raise OSError(errno.ENOTCONN, os.strerror(errno.ENOTCONN))
+            raise OSError(errno.EIO, os.strerror(errno.ENOTCONN))
         return [*self._codec.read(data)]
 
     def close(self) -> None:

@@ -192,9 +192,9 @@ class Statistics:
 class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
-    Raises UsageError if one cannot be bound or opened, and for a table without listeners. `deadmen` are those of the
-    compiled program; boards halt on what they send. Boards in `obeys` obey these payload cases only. `lengths` are
-    those of lists that mappings need (`lengths.needed_lengths`).
+    Raises UsageError if one cannot be bound or opened, and for a table without listeners, or with TCP connections.
+    `deadmen` are those of the compiled program; boards halt on what they send. Boards in `obeys` obey these payload
+    cases only. `lengths` are those of lists that mappings need (`lengths.needed_lengths`).
     """
 
     def __init__(
@@ -211,6 +211,11 @@ class Simulator:
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
+        if len(table.links) > len(table.lines):
+            raise UsageError(
+                f"{table.path} has TCP connections, which are not simulated",
+                "simulate a table that gives their boards an 'address' and no 'listener'",
+            )
         self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
         self.statistics.inboxes = {name: Inbox(wire, name, played.get(name)) for name in table.endpoints}

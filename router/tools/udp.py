@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.errors import TransportError, UsageError, did_you_mean
-from router.table.addresses import Address, SerialPlace
+from router.table.addresses import Address, LinkPlace
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable
@@ -175,9 +175,9 @@ def located(address: Address) -> Address:
 
 
 def _of_udp(address: Address, name: str) -> Address:
-    """Return the address of a name of the table. Raises UsageError for a serial line."""
-    if isinstance(address, SerialPlace):
-        raise UsageError(f"'{name}' is at the serial line {address}, but this works over UDP only")
+    """Return the address of a name of the table. Raises UsageError for a link."""
+    if isinstance(address, LinkPlace):
+        raise UsageError(f"'{name}' is at {address}, but this works over UDP only")
     return address
 
 

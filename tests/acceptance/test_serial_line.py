@@ -145,7 +145,7 @@ class Site:
         return self.samples()[key("datagrams_rejected_total", listener="drill_line", reason=reason)]
 
     def is_up(self) -> bool:
-        return self.samples()[key("link_up", listener="drill_line")] == 1
+        return self.samples()[key("link_up", endpoint="drill_board")] == 1
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def test_a_board_that_is_plugged_in_again_is_stopped_before_it_gets_commands(sit
         wait_until(
             lambda: site.samples()[key("messages_published_total", route="drill_state", topic="drill/depth")] > at
         )
-        assert site.samples()[key("link_openings_total", listener="drill_line")] == 2
+        assert site.samples()[key("link_openings_total", endpoint="drill_board")] == 2
         assert site.rejected("bad_frame") == 0
 
 

@@ -80,6 +80,7 @@ class Site:
         self.board = Board(folder / "uart")
         self.operator, self.basestation = udp("127.0.0.30"), udp("127.0.0.1")
         self.port = free_port()
+        self.uart = f"serial: {self.board.path}, baud: 460800"
 
     def program(self, line: str = "framing: cobs, checksum: crc16_ccitt_false", deadman: str = "") -> CompiledTable:
         path = self.folder / "table.yaml"
@@ -89,7 +90,7 @@ version: 1
 envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
 listen:
   rover: {{address: "127.0.0.1:{self.port}"}}
-  uart: {{serial: {self.board.path}, baud: 460800, {line}}}
+  uart: {{{self.uart}, {line}}}
 endpoints:
   operator: {{address: 127.0.0.30:8, kind: tool}}
   basestation: {{address: "127.0.0.1:{basestation}", kind: basestation}}
@@ -130,7 +131,7 @@ def test_frames_of_the_board_are_forwarded_as_datagrams(site: Site) -> None:
         site.board.send(numbered(1), numbered(2))
         assert [site.basestation.recv(100) for _ in range(2)] == [numbered(1), numbered(2)]
         assert counted(router, "datagrams_received", "uart") == 2
-        assert counted(router, "link_up", "uart") == 1
+        assert counted(router, "link_up", "board") == 1
 
 
 def test_commands_reach_the_board_as_frames_and_its_deadman_brakes_when_they_stop(site: Site) -> None:
@@ -161,21 +162,21 @@ def test_a_line_that_is_plugged_in_again_is_braked_first_and_gets_nothing_that_w
         site.board.await_frames(1)
         site.board.write(encoded(COBS, numbered(1))[:5])
         site.board.unplug()
-        wait_until(lambda: not counted(router, "link_up", "uart"))
+        wait_until(lambda: not counted(router, "link_up", "board"))
         site.drive()
         wait_until(lambda: counted(router, "messages_dropped", "manual_drive", "board", "send_error") == 1)
         site.board.plug_in()
         assert site.board.await_frames(1)[0] == BRAKE
-        wait_until(lambda: counted(router, "link_up", "uart") == 1)
-        assert counted(router, "link_openings", "uart") == 2
+        wait_until(lambda: counted(router, "link_up", "board") == 1)
+        assert counted(router, "link_openings", "board") == 2
         site.board.send(numbered(2))
         assert site.basestation.recv(100) == numbered(2)
         assert counted(router, "datagrams_rejected", "uart", "bad_frame") == 0
         assert DRIVE not in site.board.frames()
         site.drive()
         wait_until(lambda: DRIVE in site.board.frames())
-    changes = [(each["event"].split(";")[0], each["listener"]) for each in log if "serial line" in each["event"]]
-    closed, opened = ("the serial line is closed", "uart"), ("the serial line is open", "uart")
+    changes = [(each["event"].split(";")[0], each["endpoint"]) for each in log if "the link is" in each["event"]]
+    closed, opened = ("the link is closed", "board"), ("the link is open", "board")
     assert changes[0] == changes[-1] == opened
     assert {*changes[1:-1]} == {closed}
 
@@ -184,7 +185,7 @@ def test_a_board_that_is_braked_when_it_is_plugged_in_need_not_have_been_command
     with Router(site.program()) as router:
         site.board.await_frames(1)
         site.board.unplug()
-        wait_until(lambda: not counted(router, "link_up", "uart"))
+        wait_until(lambda: not counted(router, "link_up", "board"))
         site.board.plug_in()
         assert site.board.await_frames(1)[0] == BRAKE
 
@@ -192,7 +193,7 @@ def test_a_board_that_is_braked_when_it_is_plugged_in_need_not_have_been_command
 def test_a_line_that_never_opens_keeps_nobody_else_waiting(site: Site) -> None:
     site.board.unplug()
     with Router(site.program()) as router:
-        assert counted(router, "link_up", "uart") == 0
+        assert counted(router, "link_up", "board") == 0
         site.drive()
         wait_until(lambda: counted(router, "messages_dropped", "manual_drive", "board", "send_error") == 1)
         assert counted(router, "deadman_trips", "manual_drive") == 0  # what did not leave feeds nothing
@@ -267,7 +268,7 @@ def test_without_delimiters_a_bad_frame_has_the_line_opened_again(site: Site) ->
     with Router(site.program("framing: {length: u16le}")) as router:
         site.board.await_frames(1)
         site.board.write(b"\xff\xff")
-        wait_until(lambda: counted(router, "link_openings", "uart") == 2)
+        wait_until(lambda: counted(router, "link_openings", "board") == 2)
         site.board.send(numbered(1))
         assert site.basestation.recv(100) == numbered(1)
         assert counted(router, "datagrams_rejected", "uart", "bad_frame") == 1
@@ -278,7 +279,7 @@ def test_a_device_that_another_process_has_is_not_opened(site: Site) -> None:
         flock(other, LOCK_EX)
         with capture_logs() as log, Router(site.program()) as router:
             wait_until(lambda: any("another process has its device" in each.get("why", "") for each in log))
-            assert counted(router, "link_up", "uart") == 0
+            assert counted(router, "link_up", "board") == 0
             flock(other, LOCK_UN)
             assert site.board.await_frames(1)[0] == BRAKE
 
@@ -290,7 +291,7 @@ def test_a_reload_opens_the_line_with_its_new_settings(site: Site) -> None:
         let_rest(path)
         router.reload()
         site.board.framing = Framing("slip")
-        wait_until(lambda: counted(router, "link_openings", "uart") == 2)
+        wait_until(lambda: counted(router, "link_openings", "board") == 2)
         site.board.received = b""
         site.board.send(numbered(1))
         assert site.basestation.recv(100) == numbered(1)
@@ -316,7 +317,7 @@ def test_a_head_start_opens_the_line_and_the_router_goes_on_with_it(site: Site) 
     with Router(program, head_start=head_start) as router:
         site.board.send(numbered(2))
         assert site.basestation.recv(100) == numbered(2)
-        assert counted(router, "link_openings", "uart") == 1
+        assert counted(router, "link_openings", "board") == 1
         site.drive()
         wait_until(lambda: DRIVE in site.board.frames())
     assert site.board.frames()[-1] == BRAKE
@@ -341,7 +342,7 @@ def test_nothing_of_a_board_is_lost_while_another_line_flaps(site: Site, tmp_pat
     program = check_table(path, {}).program
     assert program is not None
     with Router(program) as router:
-        wait_until(lambda: counted(router, "link_up", "flaps") == counted(router, "link_up", "uart") == 1)
+        wait_until(lambda: counted(router, "link_up", "lander") == counted(router, "link_up", "board") == 1)
         site.board.await_frames(1)
         for number in range(300):
             if number % 100 == 50:

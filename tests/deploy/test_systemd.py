@@ -348,7 +348,7 @@ endpoints: {{lander: {{listener: uart, kind: board}}}}
     running.run("systemd-run", "--unit", "board", sys.executable, "-c", BOARD)
     running.wait_for("test -e /opt/uart")
     running.shell(f"printf '%s' '{table}' > /opt/line.yaml; {ROOT}/deploy/install-service.sh /opt/line.yaml")
-    running.wait_for(f"{METRICS} | grep -q '^router_link_up{{listener=\"uart\"}} 1'")
+    running.wait_for(f"{METRICS} | grep -q '^router_link_up{{endpoint=\"lander\"}} 1'")
     assert running.show("SupplementaryGroups") == "dialout"
     assert "/opt/uart" not in running.shell("systemctl cat rover-router.socket")
     own = f"/sys/fs/cgroup{running.show('ControlGroup')}/cgroup.procs"

@@ -591,9 +591,9 @@ def test_a_serial_line_that_is_closed_is_a_problem(tmp_path: Path) -> None:
     head = HEAD.replace("endpoints:\n", f"{line}endpoints:\n  lander: {{listener: uart, kind: board}}\n")
     router = Counting(small_program(tmp_path, "  ph_info: {source: lander, destinations: [basestation]}\n", head))
     [closed] = router.look(2).problems
-    assert closed.text == "the serial line uart is closed: nothing is received or sent"
+    assert closed.text == "the link to lander is closed: nothing is received or sent"
     assert "`fuser -v /dev/ttyAMA0`" in closed.remedy
-    router.count("link_up", "uart", to=1)
+    router.count("link_up", "lander", to=1)
     [silent] = router.look(10).problems
     assert silent.text == "lander has not been heard since the router started"
     assert "the wires of /dev/ttyAMA0" in silent.remedy
@@ -606,7 +606,7 @@ def test_remedies_for_a_board_on_a_serial_line_are_about_the_line(tmp_path: Path
     route = f"  manual_drive: {{source: basestation, destinations: [lander], {deadman}}}\n"
     router = Counting(small_program(tmp_path, route, head))
     router.look(1)
-    router.count("link_up", "uart", to=1)
+    router.count("link_up", "lander", to=1)
     router.count("deadman_send_errors", "manual_drive", "lander", to=3)
     router.count("messages_dropped", "manual_drive", "lander", "send_error", to=3)
     router.count("messages_dropped", "manual_drive", "lander", "send_buffer_full", to=3)

@@ -171,7 +171,7 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
     ("table", "right", "wrong", "blamed", "message"),
     [
         (GOOD, "kind: board", "kid: board", "kid", "Property kid is not allowed."),
-        (GOOD, "192.168.0.30:8", "192.168.0.30", "192.168.0.30", "must be an IPv4 address or a host name, and a port"),
+        (GOOD, "192.168.0.30:8", "192.168.0.30:", "192.168.0.30:", "must be an IPv4 address or a host name"),
         (GOOD, "queue_depth: 10", "queue_depth: ten", ": ten", 'Incorrect type. Expected "integer"'),
         (GOOD, "exact", "exat", "exat", 'Valid values: "zero_trimmed", "exact"'),
         (GOOD, "500ms", "500 millis", "500 millis", "must be a duration above zero with its unit"),

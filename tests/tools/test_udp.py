@@ -45,9 +45,7 @@ def test_what_is_at_a_serial_line_has_no_address(tmp_path: Path) -> None:
         (udp.listening, "lander"),
         (udp.origin, "lander"),
     ):
-        with pytest.raises(
-            UsageError, match=f"'{name}' is at the serial line /dev/ttyAMA0, but this works over UDP only"
-        ):
+        with pytest.raises(UsageError, match=f"'{name}' is at /dev/ttyAMA0, but this works over UDP only"):
             parse(name, table)
 
 

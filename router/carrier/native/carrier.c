@@ -161,7 +161,7 @@ static void receive_frames(struct carrier *carrier, const struct listener *liste
     int64_t began;
     link_serve(listener->link);
     while ((framed = link_next(listener->link, carrier->routing.datagram, &length, &began)) != FRAME_PARTIAL) {
-        struct received received = {.listener = listener, .length = length,
+        struct received received = {.listener = listener, .length = length, .address = link_host(listener->link),
                                     .arrived_at = wall_ns() - (boottime_ns() - began)};
         if (framed == FRAME_READY) handle(carrier, &received);
         else reject_frame(carrier, &received, framed == FRAME_BAD ? BAD_FRAME : BAD_CHECKSUM);

@@ -78,7 +78,7 @@ struct state_event {
 
 struct link_event {
     uint32_t size, kind; /* EVENT_LINK: a link was opened, was closed, or cannot be opened */
-    uint32_t listener;
+    uint32_t endpoint;   /* at its other end */
     int32_t error;       /* errno: why it is closed; 0 if it is open */
 };
 

@@ -14,12 +14,16 @@
 #include "deliver.h"
 #include "events.h"
 #include "priority.h"
+#include "tcp.h"
 #include "threads.h"
 
 enum {
     AGAIN_MS = 1000,       /* from one attempt to open it to the next */
+    NS_PER_MS = 1000000,
+    LOOKS_PER_PATIENCE = 8,
     BITS_PER_BYTE = 10,
-    ROOM_MS = 10,          /* of the line's time: what may wait in the kernel */
+    ROOM_MS = 10,          /* of a line's time: what may wait in the kernel */
+    TCP_ROOM = 4096,       /* bytes: likewise, for small frames behind one that the network interface is sending */
     LAST_MS = 100,         /* for the last bytes to leave */
     READ_AT_ONCE = 1024,   /* bytes: less than the kernel holds, so that a link delays other listeners only briefly */
     BRAKES_WAITING = 4096, /* bytes, beside a half-written frame */
@@ -30,19 +34,20 @@ enum state { CLOSED, BRAKING /* only brakes are sent */, OPEN, ENDED /* to be cl
 struct link {
     struct sender sender; /* first: its address is that of the link */
     struct timers *timers;
-    struct framing framing;
-    struct serial line;
-    uint32_t listener, up, openings;
-    uint32_t room; /* bytes */
-    int ready;     /* epoll */
-    int wake;      /* eventfd: for its thread */
+    struct link_settings of;
+    struct server *server; /* NULL if it connects itself */
+    struct client client;  /* at the server */
+    uint32_t room;         /* bytes */
+    int ready;             /* epoll */
+    int wake;              /* eventfd: for its thread */
     pthread_t thread;
     _Atomic bool is_stopping;
-    int reported; /* errno: why it is closed, as last reported */
+    int reported; /* errno: why it is closed, as last reported. With the lock of the group */
 
     pthread_mutex_t lock; /* for the rest up to `rest`; held only briefly */
     enum state state;
     int fd;
+    int offered;      /* an accepted connection; -1 for none */
     int why;          /* errno: why it is closed */
     bool has_begun;   /* a new stream, of which nothing was read */
     size_t rest_size; /* bytes that wait: of a half-written frame, then brakes */
@@ -77,7 +82,7 @@ static void end(struct link *link, int why) {
 
 /* Write as much as fits. Return the number of bytes; 0 also if the stream has ended. */
 static size_t put(struct link *link, const uint8_t *bytes, size_t size) {
-    ssize_t written = write(link->fd, bytes, size);
+    ssize_t written = write(link->fd, bytes, size); /* Python ignores SIGPIPE */
     if (written >= 0) return (size_t)written;
     if (errno != EAGAIN && errno != EINTR) end(link, errno);
     return 0;
@@ -100,6 +105,11 @@ static bool keep(struct link *link, const uint8_t *bytes, size_t size) {
     return true;
 }
 
+static bool takes_more(const struct link *link) {
+    int waiting = link->of.medium == MEDIUM_SERIAL ? serial_waiting(link->fd) : tcp_waiting(link->fd);
+    return !link->rest_size && (uint32_t)waiting <= link->room;
+}
+
 static bool is_open(const struct link *link, bool is_brake) {
     return link->state == OPEN || (is_brake && link->state == BRAKING);
 }
@@ -107,8 +117,8 @@ static bool is_open(const struct link *link, bool is_brake) {
 static int send_frame(struct link *link, const void *data, size_t size, bool is_brake) {
     put_rest(link);
     if (!is_open(link, is_brake)) return link->why;
-    if (!is_brake && (link->rest_size || (uint32_t)serial_waiting(link->fd) > link->room)) return EAGAIN;
-    size_t length = frame_write(&link->framing, data, size, link->frame);
+    if (!is_brake && !takes_more(link)) return EAGAIN;
+    size_t length = frame_write(&link->of.framing, data, size, link->frame);
     if (!length) return EMSGSIZE;
     size_t written = link->rest_size ? 0 : put(link, link->frame, length);
     if (!is_open(link, is_brake)) return link->why;
@@ -121,7 +131,7 @@ static int send_frame(struct link *link, const void *data, size_t size, bool is_
 
 /* Report, with the lock of the group held, that the link is open, or why it is closed. */
 static void report_change(struct link *link, int why) {
-    struct link_event event = {.kind = EVENT_LINK, .listener = link->listener, .error = why};
+    struct link_event event = {.kind = EVENT_LINK, .endpoint = link->of.endpoint, .error = why};
     struct ring *events = link->timers->env->reporter.events;
     if (events) put_event(events, &event, sizeof event, "");
     link->reported = why;
@@ -129,18 +139,18 @@ static void report_change(struct link *link, int why) {
 
 /* Let everything through, brakes first. The delimiter ends a frame that had begun when the link was closed. */
 static void connect_to(struct link *link, int fd) {
-    uint8_t delimiter = (uint8_t)framing_delimiter(&link->framing);
+    int delimiter = framing_delimiter(&link->of.framing);
     pthread_mutex_lock(&link->timers->lock); /* commands with a deadman wait for it */
     pthread_mutex_lock(&link->lock);
     link->fd = fd;
     link->state = BRAKING;
     link->has_begun = true;
     await(link, EPOLLIN, EPOLL_CTL_ADD);
-    if (framing_delimiter(&link->framing) >= 0) put(link, &delimiter, 1);
+    if (delimiter >= 0) put(link, &(uint8_t){(uint8_t)delimiter}, 1);
     pthread_mutex_unlock(&link->lock);
     deadmen_send_first(link->timers, &link->sender);
-    counter_set(link->timers->env->counters, link->up, 1);
-    env_count(link->timers->env, link->openings, 1);
+    counter_set(link->timers->env->counters, link->of.up, 1);
+    env_count(link->timers->env, link->of.openings, 1);
     report_change(link, 0);
     pthread_mutex_lock(&link->lock);
     if (link->state == BRAKING) link->state = OPEN;
@@ -155,29 +165,47 @@ static void disconnect(struct link *link) {
     link->fd = -1;
     link->state = CLOSED;
     pthread_mutex_unlock(&link->lock);
-    serial_close(fd);
+    if (link->of.medium == MEDIUM_SERIAL) serial_close(fd);
+    else if (atomic_load(&link->is_stopping)) close(fd);
+    else tcp_abort(fd);
     pthread_mutex_lock(&link->timers->lock);
-    counter_set(link->timers->env->counters, link->up, 0);
+    counter_set(link->timers->env->counters, link->of.up, 0);
     if (!atomic_load(&link->is_stopping)) report_change(link, why);
     pthread_mutex_unlock(&link->timers->lock);
 }
 
-/* The link cannot be opened. */
-static void fail(struct link *link, int why) {
-    pthread_mutex_lock(&link->lock);
-    link->why = why;
-    pthread_mutex_unlock(&link->lock);
-    if (why == link->reported) return;
+void link_fail(struct link *link, int why) {
     pthread_mutex_lock(&link->timers->lock);
-    report_change(link, why);
+    pthread_mutex_lock(&link->lock);
+    bool is_closed = link->state == CLOSED;
+    if (is_closed) link->why = why;
+    pthread_mutex_unlock(&link->lock);
+    if (is_closed && why != link->reported) report_change(link, why);
     pthread_mutex_unlock(&link->timers->lock);
 }
 
-/* Wait until the stream has ended or the link is to be closed, or for some time (ms; -1: no limit). */
-static void await_wake(struct link *link, int timeout) {
+/* Wait until the stream has ended or the link is to be closed, or for some time (ms; -1: no limit). Return false after that. */
+static bool await_wake(struct link *link, int timeout) {
     struct pollfd waiting = {link->wake, POLLIN, 0};
     eventfd_t ignored;
-    if (poll(&waiting, 1, timeout) > 0) eventfd_read(link->wake, &ignored);
+    if (!poll(&waiting, 1, timeout)) return false;
+    eventfd_read(link->wake, &ignored);
+    return true;
+}
+
+/* Wait until the stream has ended or the link is to be closed. End a connection whose other end acknowledges nothing. */
+static void await_end(struct link *link) {
+    if (link->of.medium == MEDIUM_SERIAL) {
+        await_wake(link, -1);
+        return;
+    }
+    struct tcp_watch watch = {0, monotonic_ns()};
+    while (!await_wake(link, (int)link->of.patience / LOOKS_PER_PATIENCE + 1)) {
+        if (tcp_unacknowledged(link->fd, &watch, monotonic_ns()) < (int64_t)link->of.patience * NS_PER_MS) continue;
+        pthread_mutex_lock(&link->lock);
+        end(link, ETIMEDOUT);
+        pthread_mutex_unlock(&link->lock);
+    }
 }
 
 static bool has_waiting(struct link *link) {
@@ -192,20 +220,51 @@ static void let_leave(struct link *link) {
     for (int left = LAST_MS; left && has_waiting(link); left--) usleep(1000);
 }
 
+static int take_offered(struct link *link) {
+    pthread_mutex_lock(&link->lock);
+    int fd = link->offered;
+    link->offered = -1;
+    pthread_mutex_unlock(&link->lock);
+    return fd;
+}
+
+/* Wait for a connection that the server accepts. Return its descriptor, or a negative errno if the link is to be closed. */
+static int await_offer(struct link *link) {
+    int fd;
+    while ((fd = take_offered(link)) < 0) {
+        if (atomic_load(&link->is_stopping)) return -ENOTCONN;
+        await_wake(link, -1);
+    }
+    tcp_settle(fd, link->of.patience);
+    return fd;
+}
+
+static int open_stream(struct link *link) {
+    const struct link_settings *of = &link->of;
+    switch (of->medium) {
+    case MEDIUM_SERIAL: return serial_open(link->path, &of->line);
+    case MEDIUM_CLIENT: return tcp_connect(of->host, of->port, of->patience, link->wake);
+    default: return await_offer(link);
+    }
+}
+
 static void *link_thread(void *of) {
     struct link *link = of;
     run_first();
+    if (link->server) link_fail(link, ENOTCONN);
     while (!atomic_load(&link->is_stopping)) {
-        int fd = serial_open(link->path, &link->line);
-        if (fd < 0) {
-            fail(link, -fd);
-        } else {
+        int64_t again = monotonic_ns() + AGAIN_MS * NS_PER_MS;
+        int fd = open_stream(link);
+        if (fd >= 0) {
             connect_to(link, fd);
-            await_wake(link, -1);
+            await_end(link);
             if (atomic_load(&link->is_stopping)) let_leave(link);
             disconnect(link);
+        } else if (!atomic_load(&link->is_stopping)) {
+            link_fail(link, -fd);
         }
-        if (!atomic_load(&link->is_stopping)) await_wake(link, AGAIN_MS);
+        int64_t left = (again - monotonic_ns()) / NS_PER_MS;
+        if (!atomic_load(&link->is_stopping) && left > 0) await_wake(link, (int)left);
     }
     return NULL;
 }
@@ -213,15 +272,14 @@ static void *link_thread(void *of) {
 /* ---- public ---- */
 
 static void release(struct link *link) {
+    if (link->offered >= 0) tcp_abort(link->offered);
     if (link->ready >= 0) close(link->ready);
     if (link->wake >= 0) close(link->wake);
     pthread_mutex_destroy(&link->lock);
     free(link);
 }
 
-struct link *link_open(struct timers *timers, const char *path, uint32_t baud, uint32_t parity, uint32_t stop_bits,
-                       uint32_t framing, uint32_t checksum, bool is_big_endian, uint32_t address, uint32_t listener,
-                       uint32_t up, uint32_t openings) {
+struct link *link_open(struct timers *timers, const struct link_settings *settings, const char *path, struct server *server) {
     struct link *link = calloc(1, sizeof *link + strlen(path) + 1);
     if (!link || lock_open(&link->lock)) {
         free(link);
@@ -230,13 +288,12 @@ struct link *link_open(struct timers *timers, const char *path, uint32_t baud, u
     strcpy(link->path, path);
     sender_on_link(&link->sender, link);
     link->timers = timers;
-    link->framing = (struct framing){framing, checksum, is_big_endian, address};
-    link->line = (struct serial){.baud = baud, .parity = parity, .stop_bits = stop_bits};
-    link->listener = listener;
-    link->up = up;
-    link->openings = openings;
-    link->room = baud / BITS_PER_BYTE * ROOM_MS / 1000;
-    link->fd = -1;
+    link->of = *settings;
+    link->server = server;
+    link->client = (struct client){.link = link, .host = settings->host};
+    bool is_line = settings->medium == MEDIUM_SERIAL;
+    link->room = is_line ? settings->line.baud / BITS_PER_BYTE * ROOM_MS / 1000 : TCP_ROOM;
+    link->fd = link->offered = -1;
     link->why = ENOTCONN;
     link->ready = epoll_create1(EPOLL_CLOEXEC);
     link->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
@@ -244,11 +301,13 @@ struct link *link_open(struct timers *timers, const char *path, uint32_t baud, u
         release(link);
         return NULL;
     }
+    if (server) server_join(server, &link->client);
     return link;
 }
 
 void link_stop(struct link *link) {
     if (atomic_exchange(&link->is_stopping, true)) return;
+    if (link->server) server_leave(link->server, &link->client);
     eventfd_write(link->wake, 1);
     pthread_join(link->thread, NULL);
 }
@@ -256,6 +315,16 @@ void link_stop(struct link *link) {
 void link_close(struct link *link) {
     link_stop(link);
     release(link);
+}
+
+void link_offer(struct link *link, int fd) {
+    pthread_mutex_lock(&link->lock);
+    int earlier = link->offered;
+    link->offered = fd;
+    end(link, ECONNABORTED);
+    pthread_mutex_unlock(&link->lock);
+    if (earlier >= 0) tcp_abort(earlier);
+    eventfd_write(link->wake, 1);
 }
 
 int link_send(struct link *link, const void *data, size_t size, bool is_brake) {
@@ -267,6 +336,8 @@ int link_send(struct link *link, const void *data, size_t size, bool is_brake) {
 
 int link_ready(const struct link *link) { return link->ready; }
 
+uint32_t link_host(const struct link *link) { return link->of.host; }
+
 void link_serve(struct link *link) {
     link->next = link->end = link->input;
     pthread_mutex_lock(&link->lock);
@@ -274,14 +345,14 @@ void link_serve(struct link *link) {
     if (is_open(link, true)) {
         ssize_t size = read(link->fd, link->input, sizeof link->input);
         if (size > 0) link->end = link->input + size;
-        else if (!size) end(link, ENOTCONN);
+        else if (!size) end(link, link->of.medium == MEDIUM_SERIAL ? EIO : ECONNRESET);
         else if (errno != EAGAIN && errno != EINTR) end(link, errno);
     }
     bool has_begun = link->has_begun;
     link->has_begun = false;
     pthread_mutex_unlock(&link->lock);
     link->read_at = boottime_ns();
-    if (has_begun) deframer_begin(&link->deframer, &link->framing);
+    if (has_begun) deframer_begin(&link->deframer, &link->of.framing);
     if (!deframer_is_within(&link->deframer)) link->began = link->read_at;
 }
 
@@ -293,7 +364,7 @@ enum framed link_next(struct link *link, uint8_t *to, size_t *length, int64_t *b
     if (framed == FRAME_READY) {
         memcpy(to, link->deframer.payload, link->deframer.length);
         *length = link->deframer.length;
-    } else if (framing_delimiter(&link->framing) < 0) {
+    } else if (framing_delimiter(&link->of.framing) < 0) {
         pthread_mutex_lock(&link->lock);
         end(link, EPROTO);
         pthread_mutex_unlock(&link->lock);

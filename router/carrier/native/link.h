@@ -1,11 +1,11 @@
-/* Links: byte streams to a board, such as a serial line, which carry frames (framing.h) instead of datagrams.
+/* Links: byte streams to a board, a serial line or a TCP connection, which carry frames (framing.h) instead of datagrams.
  *
  * A link has a thread, which opens it, and opens it again each second after it has ended. When it has opened, the deadmen that
  * send to its other end send first. Everything that can block is done by this thread.
  *
  * The receive thread reads: `ready` is an epoll descriptor that stays the same while the link is closed and opened. Any
  * thread sends, through `sender`, as to a UDP destination, and never waits: what does not fit is lost with EAGAIN. At most
- * 10 ms of the line's time wait in the kernel, so that a brake is not sent behind old commands. A brake that does not fit
+ * 10 ms of a line's time, or 4 KiB over TCP, wait in the kernel, so that a brake is not sent behind old commands. A brake that does not fit
  * waits in `rest`, behind a frame that is half written, and goes before everything else. */
 #ifndef LINK_H
 #define LINK_H
@@ -18,21 +18,45 @@
 #include "framing.h"
 #include "sender.h"
 #include "serial.h"
+#include "server.h"
 #include "timers.h"
 
 struct link;
 
-/* Open a link to a serial device. `listener` identifies it in events; `up` and `openings` are counters of the group. `framing`
- * is copied. The first member is a struct sender. Returns NULL if memory, descriptors or threads run out. */
-struct link *link_open(struct timers *timers, const char *path, uint32_t baud, uint32_t parity, uint32_t stop_bits,
-                       uint32_t framing, uint32_t checksum, bool is_big_endian, uint32_t address, uint32_t listener,
-                       uint32_t up, uint32_t openings);
+enum medium {
+    MEDIUM_SERIAL,
+    MEDIUM_CLIENT, /* TCP: the link connects */
+    MEDIUM_SERVER  /* TCP: the other end connects to a server */
+};
 
-/* Close the device, and end the thread. Bytes that were sent get 100 ms to leave. Senders get ENOTCONN. May be called again. */
+struct link_settings {
+    struct framing framing;
+    struct serial line;    /* of MEDIUM_SERIAL */
+    uint32_t medium;       /* enum medium */
+    uint32_t host, port;   /* of the other end of MEDIUM_CLIENT and MEDIUM_SERVER, which has port 0; host byte order */
+    uint32_t patience;     /* ms: how long bytes may be unacknowledged before the connection ends */
+    uint32_t endpoint;     /* in events */
+    uint32_t up, openings; /* counters of the group */
+    uint32_t reserved;
+};
+
+/* Open a link. `settings` are copied. `path` is the device of a serial line, otherwise empty, `server` that of MEDIUM_SERVER,
+ * otherwise NULL. The first member is a struct sender. Returns NULL if memory, descriptors or threads run out. */
+struct link *link_open(struct timers *timers, const struct link_settings *settings, const char *path, struct server *server);
+
+/* Close the stream, and end the thread. Bytes that were sent get 100 ms to leave. Senders get ENOTCONN. May be called again. */
 void link_stop(struct link *link);
 
 /* Stop it and free it, once no thread uses it. */
 void link_close(struct link *link);
+
+/* ---- for its server ---- */
+
+/* Use an accepted connection in place of an earlier one, which its other end has given up. */
+void link_offer(struct link *link, int fd);
+
+/* Report why the link cannot be opened (errno), unless that is known. */
+void link_fail(struct link *link, int why);
 
 /* ---- for senders ---- */
 
@@ -43,6 +67,9 @@ int link_send(struct link *link, const void *data, size_t size, bool is_brake);
 
 /* A descriptor for epoll: readable when the link has bytes to read, or room for bytes that wait. */
 int link_ready(const struct link *link);
+
+/* The IP address of the other end (host byte order); 0 for a serial line. */
+uint32_t link_host(const struct link *link);
 
 /* Read the bytes that have arrived, up to a fixed number, and write bytes that wait. */
 void link_serve(struct link *link);

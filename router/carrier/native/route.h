@@ -31,7 +31,7 @@ struct received {
     /* Set by the caller: */
     const struct listener *listener;
     size_t length;          /* of the datagram, which is cut to MAX_DATAGRAM + 1 bytes */
-    uint32_t address, port; /* of the sender; 0 for a link */
+    uint32_t address, port; /* of the sender. The port of a link is 0, and the address of a serial line */
     int64_t arrived_at;     /* wall clock, arrival in the kernel; 0 if unknown. Of a frame: when its first byte was read */
     int64_t received_at;    /* wall clock */
     int64_t now;            /* boot clock */

@@ -132,12 +132,13 @@ _KEYS: Schema = {
     "defaults": ref("defaults"),
     "listen": key(
         "Listeners",
-        "The local UDP addresses that the router binds, by a name that appears in metrics.",
+        "The local UDP addresses that the router binds, serial lines and TCP connections, by a name that appears in "
+        "metrics.",
         {"minProperties": 1, **_by_name("listener", ("any", "ros", "ephemeral"))},
     ),
     "endpoints": key(
         "Endpoints",
-        "The UDP addresses that messages come from and go to, by the name that routes use.",
+        "The addresses that messages come from and go to, by the name that routes use.",
         {"default": {}, **_by_name("endpoint", ("any", "ros"))},
     ),
     "state": key(

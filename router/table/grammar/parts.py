@@ -21,6 +21,7 @@ from router.table.model.services import (
 from router.table.model.settings import EnvelopeSettings
 from router.table.model.state import State
 from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
+from router.table.model.tcp import TcpClient, TcpServer
 
 _OF_ALL_TOPICS = ("topic", "type", "queue_depth", "qos")
 
@@ -188,32 +189,34 @@ _DEFAULTS = key("Defaults", "Values for parts of the table that do not set their
     ))),
 }))  # fmt: skip
 
-_LISTENER = {
-    "if": {"type": "object", "required": ["serial"]},
-    "then": part(
-        SerialLine,
-        framing=key(
-            "Framing",
-            "How frames are told apart in the bytes. cobs, slip and hdlc have delimiters, so the next frame can be "
-            "read after a bad one; hdlc frames are those of Pigweed, with its CRC-32. varint and {length: ...}: the "
-            "length comes first.",
-            ref("stream_framing"),
-            "cobs", "slip", "hdlc", "varint", {"length": "u16le"},
-        ),
-        checksum=key(
-            "Checksum",
-            "The checksum behind each payload, inside the frame, its low byte first; {crc16_xmodem: be}: its high byte "
-            "first. Default: none.",
-            ref("checksum"),
-            "crc16_ccitt_false", {"crc16_xmodem": "be"},
-        ),
+_FRAMES = {
+    "framing": key(
+        "Framing",
+        "How frames are told apart in the bytes. cobs, slip and hdlc have delimiters, so the next frame can be read "
+        "after a bad one; hdlc frames are those of Pigweed, with its CRC-32. varint and {length: ...}: the length "
+        "comes first.",
+        ref("stream_framing"),
+        "cobs", "slip", "hdlc", "varint", {"length": "u16le"},
     ),
-    "else": part(Listener),
+    "checksum": key(
+        "Checksum",
+        "The checksum behind each payload, inside the frame, its low byte first; {crc16_xmodem: be}: its high byte "
+        "first. Default: none.",
+        ref("checksum"),
+        "crc16_ccitt_false", {"crc16_xmodem": "be"},
+    ),
 }  # fmt: skip
+_LISTENER = ref("socket")
+for _key, _kind in (("accept", "tcp_server"), ("connect", "tcp_client"), ("serial", "serial_line")):
+    _LISTENER = {"if": {"type": "object", "required": [_key]}, "then": ref(_kind), "else": _LISTENER}
 
 PARTS: Schema = {
     "envelope": part(EnvelopeSettings),
     "listener": _LISTENER,
+    "socket": part(Listener),
+    "serial_line": part(SerialLine, **_FRAMES),
+    "tcp_client": part(TcpClient, **_FRAMES),
+    "tcp_server": part(TcpServer, **_FRAMES),
     "endpoint": {**part(Endpoint), "allOf": ENDPOINT},
     "state": _STATE,
     "service": {"if": CALLS, "then": part(CalledService), "else": part(Service)},

@@ -93,7 +93,11 @@ COMPLETE: Schema = {
                 {
                     "if": {"required": ["serial"]},
                     "then": {"required": ["baud", "framing"]},
-                    "else": {"required": required(Listener)},
+                    "else": {
+                        "if": {"anyOf": [{"required": ["connect"]}, {"required": ["accept"]}]},
+                        "then": {"required": ["framing"]},
+                        "else": {"required": required(Listener)},
+                    },
                 }
             ),
             "endpoints": _each(

@@ -70,7 +70,7 @@ VALUES: Schema = {
     "variable": {"type": "string", "pattern": _VARIABLE},
     "address": _text(f"^{_HOST}:{_PORT}$", "be an IPv4 address and a port, such as '192.168.0.30:8'"),
     "endpoint_address": _text(
-        rf"^(?:(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}|learned)$",
+        rf"^(?:(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}|{_HOST}|learned)$",
         "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8', or 'learned'",
     ),
     "device": _text(r"^/\S+$", "be the path of a device, such as '/dev/serial/by-id/usb-board-if00'"),

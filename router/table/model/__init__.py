@@ -16,6 +16,7 @@ from router.errors import Located, SourceSpan
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway
 from router.table.model.routes import Route
+from router.table.model.serial import SerialLine
 from router.table.model.services import CalledService, Service
 from router.table.model.settings import EnvelopeSettings, NodeSettings, RecordSettings, ServerSettings
 from router.table.model.state import State
@@ -71,12 +72,17 @@ class RouteTable:
     @property
     def sockets(self) -> tuple[Listener, ...]:
         """The listeners that are UDP sockets."""
-        return tuple(listener for listener in self.listeners.values() if listener.line is None)
+        return tuple(listener for listener in self.listeners.values() if listener.link is None)
+
+    @property
+    def links(self) -> tuple[Listener, ...]:
+        """The listeners that are serial lines, TCP clients or TCP servers."""
+        return tuple(listener for listener in self.listeners.values() if listener.link is not None)
 
     @property
     def lines(self) -> tuple[Listener, ...]:
         """The listeners that are serial lines."""
-        return tuple(listener for listener in self.listeners.values() if listener.line is not None)
+        return tuple(listener for listener in self.listeners.values() if isinstance(listener.link, SerialLine))
 
     @property
     def envelope_names(self) -> tuple[Mapping[str, str], Mapping[str, str]]:

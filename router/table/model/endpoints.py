@@ -10,6 +10,7 @@ from router.table.addresses import BROADCAST, ENDPOINT, GROUP, LOCAL, Address
 from router.table.keys import SOME, Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.model.serial import SerialLine
+from router.table.model.tcp import TcpClient, TcpServer
 from router.table.units import DATA_RATE, PATIENCE, SIZE
 
 
@@ -33,8 +34,8 @@ class EndpointKind(enum.Enum):
 class Listener:
     """A local UDP address that the router binds.
 
-    `span` is its name in the table. `receive_buffer` is in bytes. Of a serial line, the table sets only `line`, and its
-    address is a SerialPlace.
+    `span` is its name in the table. `receive_buffer` is in bytes. Of a serial line and of TCP, the table sets only
+    `link`, and the address is a LinkPlace.
     """
 
     name: str
@@ -66,12 +67,21 @@ class Listener:
 
     Example: [224.5.23.2]
     """
-    line: SerialLine | None = None
+    link: SerialLine | TcpClient | TcpServer | None = None
     envelope: Located[str] | None = None
     """Which of the table's `envelopes` its datagrams are. Needed if there are several.
 
     Example: vision
     """
+
+    @property
+    def line(self) -> SerialLine | None:
+        return self.link if isinstance(self.link, SerialLine) else None
+
+    @property
+    def accepts(self) -> bool:
+        """Whether it is a TCP server."""
+        return isinstance(self.link, TcpServer)
 
     @property
     def bound_to(self) -> str:
@@ -91,10 +101,10 @@ EPHEMERAL = "ephemeral"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A named UDP address, or the other end of a serial line: a board, a basestation, a tool.
+    """A named UDP address, or the other end of a serial line or TCP connection: a board, a basestation, a tool.
 
-    `span` is its name in the table. It has one of `unicast`, `group` and `broadcast`; the other end of a serial line
-    has a SerialPlace as `unicast`. `bandwidth` is in bytes per second, `stale_after` in ns, None for never. `send_from`
+    `span` is its name in the table. It has one of `unicast`, `group` and `broadcast`; the other end of a link has a
+    LinkPlace as `unicast`. `bandwidth` is in bytes per second, `stale_after` in ns, None for never. `send_from`
     is a listener's name, EPHEMERAL, or None if it is not set.
     """
 
@@ -103,7 +113,8 @@ class Endpoint:
     unicast: Annotated[Located[Address] | None, ENDPOINT, Named("address")] = None
     """Where datagrams to it are sent. Datagrams from it are recognised by the IP address. The running router resolves
     a host name, again and again. learned: the address and port of the first sender of a message for a route with this
-    source, until that sender has been silent for longer than `stale_after`. The other end of a serial line has none.
+    source, until that sender has been silent for longer than `stale_after`. The other end of a serial line or of
+    `connect` has none; a client of `accept` has an IP address without a port.
 
     Title: Endpoint address
     Example: 192.168.0.30:8
@@ -153,7 +164,7 @@ class Endpoint:
     """
     listener: Located[str] | None = None
     """Accept its datagrams only at this listener; at any other, a datagram from its address counts as a stranger's. Or
-    the serial line that it is at the other end of. Default: accept them at every listener.
+    the serial line or TCP listener that it is at the other end of. Default: accept them at every listener.
 
     Example: radio
     """

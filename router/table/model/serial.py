@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from router.errors import Located, SourceSpan
 from router.table.keys import Range, Shape
@@ -75,6 +75,8 @@ class SerialLine:
 
     `span` is the listener's name in the table.
     """
+
+    NOUN: ClassVar[str] = "serial line"
 
     span: SourceSpan
     serial: Annotated[Located[str], Shape("device")]

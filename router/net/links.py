@@ -1,4 +1,4 @@
-"""Why a serial line cannot be opened or was closed, in words, and who has its device."""
+"""Why a link, a serial line or TCP connection, cannot be opened or was closed, in words; who has a device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 _MEANINGS: Mapping[int, tuple[str, str]] = {
     errno.ENOENT: ("its device is not there", "plug it in, or correct `serial`: `ls -l /dev/serial/by-id`"),
-    errno.EACCES: ("the router may not open its device", "add its user to the group of the device: `ls -lL DEVICE`"),
+    errno.EACCES: ("the router may not open it", "add the router's user to the group of the device: `ls -lL DEVICE`"),
     errno.EBUSY: ("another process has its device", "`fuser -v DEVICE` names it; ModemManager takes new devices"),
     errno.ENOTTY: ("it is no serial device", "correct `serial`"),
     errno.EINVAL: ("its driver refuses the settings", "correct `baud`, `parity` and `stop_bits`"),
@@ -18,8 +18,21 @@ _MEANINGS: Mapping[int, tuple[str, str]] = {
         "compare `framing`, `checksum` and `baud` with the firmware's; prefer `framing: cobs`",
     ),
     **dict.fromkeys(
-        (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOTCONN),
+        (errno.EIO, errno.ENXIO, errno.ENODEV),
         ("its device was unplugged", "check plug and power; `dmesg` says more"),
+    ),
+    errno.ENOTCONN: ("it has not connected yet", "check its power and network, and the address that it connects to"),
+    errno.ECONNABORTED: ("it has connected again", "if that goes on, look whether two boards have its address"),
+    errno.ECONNREFUSED: ("nothing listens there", "start its program, or correct `connect`"),
+    errno.EADDRINUSE: ("another process has the port of the server", "`ss -ltnp` names it"),
+    errno.EADDRNOTAVAIL: ("the server's address does not exist here", "`ip -br address` shows those that do"),
+    errno.ETIMEDOUT: ("it does not answer", "check its power and network"),
+    **dict.fromkeys(
+        (errno.EHOSTUNREACH, errno.ENETUNREACH),
+        ("it cannot be reached", "check its power, cable or radio, and address"),
+    ),
+    **dict.fromkeys(
+        (errno.ECONNRESET, errno.EPIPE), ("the other end has closed the connection", "its log may say why")
     ),
 }
 
