@@ -37,12 +37,13 @@ IMPORTS = {
     "services": LANGUAGE,
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
-    "rehearsal": f"{LANGUAGE} values datagrams image carrier recording",
-    "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal",
+    "rehearsal": f"{LANGUAGE} values datagrams image carrier recording services",
+    "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal"
+    " services",
     "app": f"{GROUND} {LANGUAGE} values datagrams image net carrier startup_image ros gateway recording observe"
     " services",
     "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools image carrier"
-    " startup_image app",
+    " startup_image app services",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 

@@ -30,6 +30,9 @@ from router.types.protobuf import PayloadCase
 REQUEST, REASON = "request", "reason"
 """Names in `fields` of a reply and in `on_timeout`, and in the latter."""
 
+UNANSWERED = MessageType("a call without a response", (Field(REASON, String()),))
+"""What `on_timeout` is filled from, besides the kept values."""
+
 _PLACE = 8
 """Bytes of a value that is kept."""
 
@@ -107,7 +110,7 @@ def _request(
     fillers = mapping.plan.members or ((whole.fields[1], Unset(whole.fields[1].type, None, call.span)),)
     plan = Record(whole, ((whole.fields[0], first), *fillers), call.span)
     topic = Topic(Located(label, call.span), call.span, type=Located(message.name, call.type.span))
-    return Target(topic, type=whole, plan=plan, rows=tuple(mapping.rows))
+    return Target(topic, type=message, plan=plan, rows=tuple(mapping.rows))
 
 
 def _replies(
@@ -115,11 +118,10 @@ def _replies(
 ) -> CheckedRoute:
     """Return the route of the replies: responses, and reasons why there are none."""
     label, reply = service_label(declared.name), declared.reply
-    reason = MessageType("a call without a response", (Field(REASON, String()),))
     found: list[CheckedSubscription] = []
     for name, fields, message in (
         (label, reply.fields, response),
-        (f"{label}.on_timeout", declared.on_timeout, reason),
+        (f"{label}.on_timeout", declared.on_timeout, UNANSWERED),
     ):
         topic = Topic(Located(name, reply.span), reply.span, type=Located(response.name, declared.call.type.span))
         found += _feeds(lookup, declared, case, topic, fields, message, kept)

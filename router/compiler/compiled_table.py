@@ -39,9 +39,17 @@ def state_label(name: str) -> str:
     return f"{STATE}.{name}"
 
 
+_SERVICE = "service."
+
+
 def service_label(name: str) -> str:
     """Return the name of a service as the route and topic of its requests, and as the target of its replies."""
-    return f"service.{name}"
+    return f"{_SERVICE}{name}"
+
+
+def is_service(label: str) -> bool:
+    """Return whether a service has this name in place of a topic: names of topics have no dots."""
+    return label.startswith(_SERVICE)
 
 
 OUTCOMES: Mapping[str, str] = {

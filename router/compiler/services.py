@@ -257,7 +257,7 @@ def _reply(lookup: Lookup, declared: Service, case: PayloadCase, message: Messag
     fillers = mapping.plan.members or ((numbered.fields[1], Unset(numbered.fields[1].type, None, reply.span)),)
     plan = Record(numbered, ((numbered.fields[0], leading), *fillers), reply.span)
     topic = Topic(Located(label, reply.span), reply.span, type=Located(message.name, declared.type.span))
-    return Target(topic, type=numbered, plan=plan, rows=tuple(mapping.rows))
+    return Target(topic, type=message, plan=plan, rows=tuple(mapping.rows))
 
 
 def _mapped(mapping: FieldMapping, message: MessageType) -> FieldMapping:

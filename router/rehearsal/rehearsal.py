@@ -15,6 +15,7 @@ from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import Answer, Series
 from router.datagrams import Peer
 from router.library import library
+from router.services.calls import HEADER, SIZE_OF_NUMBER
 
 START = 1_767_225_600_000_000_000
 """The time at the start, unless another one is given: the beginning of 2026, in ns of the wall clock."""
@@ -167,6 +168,7 @@ class Rehearsal:
         self.ahead = 0
         self._data = b""
         self._simulation.adopt(program)
+        self._program, self._services = program, _services(program)
         self._series = _series(program)
         self._plans = {plan.name: plan for plan in program.states}
         self.states = self._initial()
@@ -186,6 +188,8 @@ class Rehearsal:
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
         """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
+        if topic in self._services:
+            cdr = self._services[topic].behind(cdr)
         self._simulation.message(topic, cdr, self._wall if sent_ns is None else sent_ns)
         self._read()
 
@@ -202,6 +206,7 @@ class Rehearsal:
     def reload(self, program: CompiledTable) -> None:
         """Continue with another program, whose counters continue those of the current one."""
         self._simulation.adopt(program)
+        self._program, self._services = program, _services(program)
         self._series |= _series(program)
         self._plans = {plan.name: plan for plan in program.states}
         self.states = self._initial() | {name: value for name, value in self.states.items() if name in self._plans}
@@ -211,6 +216,7 @@ class Rehearsal:
         """Start again with the current program, as a router that has just started."""
         self._simulation.restart(self._start)
         self._at, self.ahead, self._data = self._start, 0, b""
+        self._services = _services(self._program)
         self.states = self._initial()
         self.events.clear()
 
@@ -224,8 +230,8 @@ class Rehearsal:
             match record:
                 case Time(at):
                     self._at = at
-                case Output(_, data):
-                    self._data = data
+                case Output(target, data):
+                    self._data = self._services[target].taken(data) if target in self._services else data
                 case Increment(counter, _):
                     self._count(counter)
                 case DeadmanChange(route, is_tripped):
@@ -258,6 +264,35 @@ class Rehearsal:
         event = self.events[-1]
         if isinstance(event, (Dropped, Rejected, Superseded)):
             self.events[-1] = replace(event, detail=detail)
+
+
+class _Service:
+    """Adds to messages of a service what precedes them in the carrier, and removes it: the number of a call, or what is
+    kept of the last message that called it.
+    """
+
+    def __init__(self, kept: int, *, is_numbered: bool) -> None:
+        self._size, self._is_numbered = kept, is_numbered
+        self._first = bytes(kept)
+
+    def behind(self, message: bytes) -> bytes:
+        if self._is_numbered:
+            self._first = (int.from_bytes(self._first, "little") + 1).to_bytes(self._size, "little")
+        return message[:HEADER] + self._first + message[HEADER:]
+
+    def taken(self, message: bytes) -> bytes:
+        end = HEADER + self._size
+        if not self._is_numbered:
+            self._first = message[HEADER:end]
+        return message[:HEADER] + message[end:]
+
+
+def _services(program: CompiledTable) -> dict[str, _Service]:
+    """Return the services of a program by what stands for them in place of topics."""
+    services = {plan.label: _Service(SIZE_OF_NUMBER, is_numbered=True) for plan in program.services}
+    for plan in program.called:
+        services[plan.label] = services[plan.failed] = _Service(plan.kept, is_numbered=False)
+    return services
 
 
 def _series(program: CompiledTable) -> dict[int, Series]:

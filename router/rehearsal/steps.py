@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from router.compiler import Checked
-from router.compiler.compiled_table import CompiledTable, StatePlan
+from router.compiler.called import UNANSWERED
+from router.compiler.compiled_table import CompiledTable, StatePlan, service_label
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.network import sent_by
@@ -237,7 +238,11 @@ class Names:
     def _subscribed(self) -> Mapping[str, MessageType]:
         subscriptions = [subscription for route in self._checked.routes for subscription in route.subscriptions]
         subscriptions += [state.feed for state in self._checked.states.values() if state.feed is not None]
-        return {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
+        types = {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
+        types |= {service_label(each.declared.name): each.request_type for each in self._checked.services}
+        for plan, called in zip(self._program.called, self._checked.called, strict=True):
+            types |= {plan.label: called.response_type, plan.failed: UNANSWERED}
+        return types
 
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)

@@ -23,7 +23,7 @@ Caller_contra = TypeVar("Caller_contra", contravariant=True)
 NEVER = (1 << 63) - 1
 """When nothing is due."""
 
-HEADER, _NUMBER = 4, 8
+HEADER, SIZE_OF_NUMBER = 4, 8
 """Bytes of a message before its number, and of the number."""
 
 
@@ -178,4 +178,4 @@ def _number_of(message: bytes) -> int:
 
 
 def _without_number(message: bytes) -> bytes:
-    return message[:HEADER] + message[HEADER + _NUMBER :]
+    return message[:HEADER] + message[HEADER + SIZE_OF_NUMBER :]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedState, Target
-from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan
+from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan, is_service
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
@@ -86,13 +86,15 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
             yield from _destination(served, checked, everything, "unchanged")
     for feed in checked.subscriptions:
         yield ""
-        yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
-        yield _quality(feed.topic)
+        origin = feed.topic.topic.value
+        yield f"  from {_named(origin)}: {feed.type}  ({feed.topic.span})"
+        if not is_service(origin):
+            yield _quality(feed.topic)
         if feed.topic.when is not None:
             yield f"    when {feed.topic.when.text}"
         for served in feed.targets:
             yield ""
-            yield from _destination(served, checked, everything, f"from topic {feed.topic.topic.value}")
+            yield from _destination(served, checked, everything, f"from {_named(origin)}")
 
 
 def tried_route(
@@ -214,13 +216,14 @@ def _destination(served: Target, checked: CheckedRoute, everything: Checked, how
 
 def _topic(served: Target, topic: Topic, route: Route) -> Iterator[str]:
     """Yield what happens to a message that is published, in this order."""
-    yield f"  topic {served.label}: {topic.type_name}  ({served.span})"
-    yield _quality(topic)
-    if not qos_of(topic).serves_late_joiners:
-        yield "    only while a node subscribes"
+    yield f"  {_named(served.label)}: {topic.type_name}  ({served.span})"
+    if not is_service(served.label):
+        yield _quality(topic)
+        if not qos_of(topic).serves_late_joiners:
+            yield "    only while a node subscribes"
     yield from _conditions(served, route)
     yield from _mapping(served)
-    if served.plan is not None:
+    if served.plan is not None and not is_service(served.label):
         size, exact = message_size(served.plan)
         yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
     yield from _waiting(served)
@@ -282,6 +285,11 @@ def _bounded(message: BoardMessage) -> Iterator[BoardField]:
             yield from _bounded(field.message)
 
 
+def _named(label: str) -> str:
+    """Return what a target or an origin is, with its name."""
+    return label if is_service(label) else f"topic {label}"
+
+
 def _size(bound: int, unit: str, *, is_fixed: bool) -> str:
     return f"{plural(bound, unit)} or none" if is_fixed else f"up to {plural(bound, unit)}"
 
@@ -313,6 +321,8 @@ def _unset(plan: Plan, prefix: str) -> Iterator[str]:
             yield prefix
         case Record():
             for member, inner in plan.members:
+                if member.name not in plan.type.names:  # the router adds it
+                    continue
                 yield from _unset(inner, f"{prefix}.{member.name}" if prefix else member.name)
         case Items():
             for index, inner in enumerate(plan.items):
