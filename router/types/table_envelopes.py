@@ -42,7 +42,7 @@ def _named(envelope: Envelope, label: str, names: Mapping[str, str]) -> Envelope
     """Return the envelope with its name, and the names of its cases, in a table."""
     cases = {names[name]: replace(case, name=names[name], envelope=label) for name, case in envelope.cases.items()}
     unroutable = {names[name]: member for name, member in envelope.unroutable.items()}
-    parts = frozenset(names[name] for name in envelope.parts)
+    parts = frozenset(names[name] for name in envelope.parts if name in names)
     return replace(envelope, cases=cases, unroutable=unroutable, parts=parts, label=label)
 
 
