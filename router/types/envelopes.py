@@ -122,7 +122,7 @@ def named_envelope(schema: ProtoSchema, name: Located[str], payload: Located[str
         cases,
         max(sizes, default=0) + largest_fields(beside, schema.board_options),
         beside=MessageType(envelope.full_name, members),
-        parts=frozenset(_parts(messages)),
+        parts=frozenset(cases.keys() & _parts(messages)),
     )
 
 

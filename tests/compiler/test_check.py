@@ -127,6 +127,24 @@ def test_set_is_unused_where_the_router_only_forwards(tmp_path: Path, drive: str
     assert found == [message.format(name) for name in unused]
 
 
+def test_types_of_protobuf_itself_are_no_cases_of_an_envelope_with_names(tmp_path: Path) -> None:
+    (tmp_path / "wrapped.proto").write_text(
+        'syntax = "proto3"; import "google/protobuf/timestamp.proto";'
+        "message Wrapped { string name = 1; bytes data = 2; }"
+        "message At { google.protobuf.Timestamp time = 1; }"
+    )
+    table = tmp_path / "table.yaml"
+    table.write_text(
+        f"version: 1\nenvelope: {{protos: {tmp_path}, message: Wrapped, case: name, payload: data}}\n"
+        "listen: {rover: {address: 127.0.0.1:5000}}\nendpoints: {tool: {address: 127.0.0.3:9000, kind: tool}}\n"
+        "routes: {At: {source: any, destinations: tool}}\n"
+    )
+    checked = check_table(table, {})
+    assert [each.code for each in checked.diagnostics] == [Code.NOT_LOCKED]
+    assert checked.program is not None
+    assert [*checked.program.envelopes.cases] == ["At"]
+
+
 def test_set_is_refused_where_a_datagram_is_the_payload_itself(tmp_path: Path) -> None:
     table = tmp_path / "table.yaml"
     framed = TABLES / "framed"
