@@ -26,7 +26,10 @@ _CLOSE = Operation(Op.CLOSE)
 
 
 def protobuf_message(lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b"") -> list[Placed]:
-    """Return the operations that write an envelope, each with its place: the bytes `beside`, and the payload."""
+    """Return the operations that write an envelope, each with its place: the bytes `beside`, and the payload.
+
+    There is at least one, also for an envelope without bytes: a target without operations forwards datagrams.
+    """
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # of upb
     return _around(_Writer(lowering).record(plan, descriptor, ""), case, beside, Place(plan.span, ""))
 
@@ -42,7 +45,7 @@ def _around(inside: Iterable[Placed], case: PayloadCase, beside: bytes, place: P
     if around.tag:
         inside = _lengthened(around.tag, list(merged(inside)), place, is_always=not around.is_optional)
     before, after = (at(place, known(data)) if data else [] for data in (beside + around.before, around.after))
-    return list(merged([*before, *inside, *after]))
+    return list(merged([*before, *inside, *after])) or at(place, known(b""))
 
 
 def protobuf_fields(lowering: Lowering, plan: Record, descriptor: Descriptor) -> list[Placed]:
