@@ -66,7 +66,8 @@ Every series exists at 0 from the start. The counters balance. Per listener, rec
 and target, accepted + split = delivered + dropped + filtered + collected + waiting + held. Held messages are in open
 frames, in the queue of a `bandwidth`, or held by `on_limit: latest`. Delivered means sent or published. With
 `for_each`, each element is a message: the route accepts each one from ROS; for a topic, those after the first are
-split. A deadman's datagrams are counted only in its own metrics, and their bytes nowhere."""
+split. A reply counts the messages of its endpoint. A deadman's datagrams are counted only in its own metrics, and their
+bytes nowhere."""
 _UNCOUNTED = """\
 The counters begin when a message has reached the router and end when it was handed to the kernel or to DDS. They do
 not see:"""

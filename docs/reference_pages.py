@@ -49,6 +49,7 @@ TABLE = (
     Section("Routes", "routes.CASE", "definitions.route"),
     Section("Source topics", "routes.CASE.source", "definitions.source_topic"),
     Section("Destinations", "routes.CASE.destinations", "definitions.destination.then"),
+    Section("Replies", "routes.CASE.reply", "definitions.reply.then"),
     Section("Topics", "routes.CASE.topics", "definitions.topic.then"),
     Section("Quality of service", "qos", "definitions.qos.else"),
     Section("Fields", "fields", "definitions.fields.else"),

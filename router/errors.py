@@ -100,7 +100,10 @@ class Code(enum.Enum):
         "Two local addresses or Zenoh keys are the same, or two endpoints cannot be told apart.",
     )
     OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to discover others, outside the table's `networks`.")
-    FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or this router.")
+    FORWARDING_LOOP = (
+        "forwarding-loop",
+        "A destination is the message's own source, or this router; or replies lead back to the first one.",
+    )
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
     TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes or gateways give one topic different types.")
     UNKNOWN_ROS_TYPE = ("unknown-ros-type", "Neither an installed package nor `schemas/` defines this interface.")

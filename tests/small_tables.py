@@ -109,8 +109,9 @@ class Ledger:
             yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
 
     def _fates(self, plan: RoutePlan) -> Iterator[str]:
-        route, accepted = plan.route, self.total("messages_received", plan.route)
+        route = plan.route
         for target in plan.targets:
+            accepted = self.total("messages_received", route, *([target.label] if target.reply else []))
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected", "messages_waiting")
             fates = [self.total(metric, route, target.label) for metric in metrics]

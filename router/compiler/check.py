@@ -23,6 +23,7 @@ from router.compiler.lookup import Definitions, Lookup
 from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
+from router.compiler.replies import reply_findings
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.services import check_services
 from router.compiler.states import check_states, condition_findings
@@ -140,6 +141,7 @@ def check_table(
         *lookup.findings,
         *condition_findings(lookup, routes),
         *clash_findings(table),
+        *reply_findings(routes),
         *brake_findings(table, own_routes),
         *topic_findings(table, [checked.route for checked in own_routes]),
     ]
@@ -194,6 +196,7 @@ def _limits(table: RouteTable, envelopes: Envelopes, envelope: Envelope, lock: L
     named |= {service.request.case.value for service in table.services.values()}
     named |= {service.reply.case.value for service in table.called.values()}
     named |= {payload.case.value for route in table.routes if route.deadman for payload in route.deadman.payloads}
+    named |= {route.reply.case.value for route in table.routes if route.reply}
     types = {case.type.name for table_case in named if (case := envelopes.cases.get(table_case)) is not None}
     cases = [case for case in envelope.cases.values() if case.type.name in types]
     longest, payloads = lock.max_size or envelope.max_size, payload_fields(envelope, cases, schema.board_options)
@@ -214,7 +217,7 @@ def _board_findings(table: RouteTable, boards: Mapping[str, BoardLimits]) -> Ite
 def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Diagnostic]:
     """Yield findings for fields beside the payload that nothing fills in envelopes that the router makes.
 
-    It makes them from messages from ROS and for deadmen; forwarded ones keep their fields.
+    It makes them from messages from ROS, for deadmen and as replies; forwarded ones keep their fields.
     """
     table = lookup.table
     for name in dict.fromkeys(name for checked in routes for name in _made_for(checked)):
@@ -230,7 +233,7 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
             yield Diagnostic(endpoint.span, Code.MISSING_KEY, message, hint)
         names = [member.name for member in empty if not member.is_required]
         if endpoint.kind is EndpointKind.BOARD and names and settings.because is None:
-            made = f"envelopes for '{name}' from ROS or deadman timers"
+            made = f"envelopes that the router makes for '{name}'"
             what = f"nothing fills {', '.join(names)} of {envelope.name} in {made}"
             more = ", ..." * (len(names) > 1)
             hint = f"write `set: {{{names[0]}: VALUE{more}}}` in the endpoint, or `because: why` in 'envelope'"
@@ -253,6 +256,7 @@ def _unused_sets(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterator[Dia
 def _made_for(checked: CheckedRoute) -> Iterator[str]:
     """Yield the endpoints to which a route sends envelopes that the router makes."""
     yield from (target.label for target in checked.targets if target.rewrapped)
+    yield from (target.label for target in checked.targets if target.reply is not None)
     yield from (target.label for subscription in checked.subscriptions for target in subscription.targets)
     yield from (name for name, _ in (checked.deadman.datagrams if checked.deadman else ()))
 

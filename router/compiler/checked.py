@@ -34,6 +34,7 @@ class Target:
     payload case `rewrapped`. `rows` describe the mapping for `explain`. `deadmen` are the routes whose deadmen each
     command to this target feeds (its own route's) or disarms. `beside` is what `set` of the endpoint fills in messages
     that the router makes. `is_request`: its messages are requests of a service, and never wait.
+    `reply` is the payload case of a reply, which goes to `endpoint` when that is the sender, and never waits either.
 
     `lowering` adds the routines: `condition` for its `when`, and `message`, which writes its message. They are empty
     without a `when`, or without a `plan`. `gate` is the part of the condition that reads only states, if messages may
@@ -54,6 +55,7 @@ class Target:
     deadmen: tuple[str, ...] = ()
     beside: Beside | None = None
     is_request: bool = False
+    reply: PayloadCase | None = None
     for_each: Node | None = None
     condition: Routine = ()
     gate: Routine = ()
@@ -92,7 +94,8 @@ class Target:
     @property
     def is_deferred(self) -> bool:
         """Whether its messages may be deferred and then sent by another thread: see `on_limit` and `bandwidth`."""
-        has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None and not self.is_request
+        may_wait = not self.is_request and self.reply is None
+        has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None and may_wait
         return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 
 

@@ -70,7 +70,7 @@ def check_deadman(lookup: Lookup, route: Route) -> DeadmanPlan | None:
 
 
 def _require_deadman(lookup: Lookup, route: Route) -> None:
-    """Warn about the first board that gets commands from a route without a deadman."""
+    """Warn about the first board that gets commands or replies from a route without a deadman."""
     for destination in route.destinations:
         name = destination.endpoint.value
         if route.no_deadman is None and name in lookup.boards:
@@ -78,11 +78,16 @@ def _require_deadman(lookup: Lookup, route: Route) -> None:
             hint = "write `deadman: {timeout: 500ms, send: {CASE: {FIELD: VALUE}}}`, or `deadman: {none: why}`"
             lookup.report(destination.endpoint.span, Code.NO_DEADMAN, message, hint)
             return
+    board = next((source.value for source in route.sources if source.value in lookup.boards), None)
+    if route.reply is not None and board is not None and route.no_deadman is None:
+        message = f"'{board}' is a board, and replies feed no deadman: nothing stops what they move"
+        hint = "if they move nothing, write `deadman: {none: replies move nothing}`"
+        lookup.report(route.reply.case.span, Code.NO_DEADMAN, message, hint)
 
 
 def _require_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if not route.destinations:
-        if route.topics:
+        if route.topics or route.reply is not None:
             message = f"'{route.case.value}' has no destinations, so there are no commands to watch"
             lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "remove the deadman, or add destinations")
         return

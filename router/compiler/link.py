@@ -65,6 +65,7 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
             outbound[topic] = (*outbound.get(topic, ()), plan)
     deadmen = tuple(route.deadman for route in served if route.deadman)
     destinations = {to.endpoint.value for route in served for to in route.route.destinations}
+    destinations |= {target.label for route in served for target in route.targets if target.reply}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     services = tuple(map(_service, checked.services))
     called = tuple(map(_called, checked.called))
@@ -215,5 +216,6 @@ def _targets(checked: CheckedRoute, lowered: Lowered, feed: CheckedSubscription 
         feeds = {served.route: served for served in lowered.from_ros[feed.topic.topic.value]}
         yield from feeds[name].targets.values()
     for target in checked.targets:
-        route = (lowered.to_topics if target.is_topic else lowered.to_destinations).get(name)
+        kind = lowered.to_topics if target.is_topic else lowered.replies if target.reply else lowered.to_destinations
+        route = kind.get(name)
         yield route.targets.get(target.label, target) if route else target

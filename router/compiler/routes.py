@@ -15,6 +15,7 @@ from router.compiler.feeds import deadmen_of
 from router.compiler.lookup import NO_NAMES, Lookup, Recipient
 from router.compiler.mapping import build
 from router.compiler.obeyed import check_obeyed
+from router.compiler.replies import check_reply
 from router.compiler.states import sets_state
 from router.compiler.topics import qos_findings, resolved, stamp_of, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
@@ -104,7 +105,7 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         return CheckedRoute(route, case)
     _sources(lookup, route, case)
     is_setter = any(True for _ in sets_state(lookup.table.states.values(), route))
-    if not route.destinations and not route.topics and not is_setter:
+    if not route.destinations and not route.topics and route.reply is None and not is_setter:
         places = "destinations" if route.is_outbound else "destinations or topics"
         message, hint = f"'{route.name}' has no targets", f"add {places}, or ignore it with `ignore: reason`"
         lookup.report(route.span, Code.NO_TARGET, message, hint)
@@ -175,6 +176,7 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
         ros_type = lookup.ros_type(topic)
         if ros_type is not None and (published := _publish(lookup, route, case, topic, ros_type, names)):
             targets.append(published)
+    targets += check_reply(lookup, route, case)
     order = _order(lookup, case, route.order) if route.order else None
     collect = _collect(lookup, route, case, route.collect) if route.collect else None
     return replace(made, targets=tuple(targets), order=order, collect=collect)

@@ -17,6 +17,7 @@ from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, R
 from router.compiler.metrics import Counters
 from router.image.memory import Symbols
 from router.image.names import Names
+from router.table.addresses import LinkPlace
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.serial import LENGTHS, SerialLine
 from router.table.model.tcp import TcpClient, TcpServer
@@ -115,6 +116,15 @@ class Openings:
 
     def sender(self, endpoint: str) -> int:
         return self.symbols.address("sender", endpoint)
+
+    def replier(self, endpoint: str) -> int:
+        """Open the sender of replies to an endpoint, which sends to wherever a datagram came from.
+
+        At the other end of a link, that is the link.
+        """
+        if isinstance(self.program.table.endpoints[endpoint].address.value, LinkPlace):
+            return self.sender(endpoint)
+        return self._open(("replier", endpoint), "sender_open", -1, -1, 0, 0)
 
     def limit(self, plan: RoutePlan, target: Target, source: str | None) -> int:
         """Open the limit of a target with `max_rate` for one source of its route."""

@@ -129,6 +129,19 @@ class TargetWriter:
         written.layout, written.sources = routines.layout(), self.names_of_senders()
         return written
 
+    def replies(self, plan: RoutePlan) -> Any:
+        """Write the replies of a route; None without any."""
+        targets = [target for target in plan.targets if target.reply]
+        if not targets:
+            return None
+        labels = [target.label for target in targets]
+        by_column = [labels.index(name) if name in labels else len(labels) for name in self._labels_of_senders()]
+        written = c.Replies(
+            to=self.of_datagrams(plan, targets, self.program.lowered.replies[plan.route]),
+            by_column=self.arrays.array(ctypes.c_uint32, by_column),
+        )
+        return ctypes.pointer(self.arrays.add(written))
+
     def targets(self, plan: RoutePlan, targets: Sequence[Target], routines: Routines | None) -> c.Targets:
         """Write the targets, without their layout. Only if they have routines, `routines` is needed."""
         array = self.arrays.array(c.Target, [self._target(plan, each, routines) for each in targets])
@@ -140,8 +153,9 @@ class TargetWriter:
             route=number(plan.route),
             topic=c.NO_NAME if plan.topic is None else number(plan.topic),
         )
-        sources = self._sources_of(plan)
+        senders = self._sources_of(plan)
         for written, target in zip(array or (), targets, strict=True):
+            sources = {at: each for at, each in senders.items() if not target.reply or each == target.label}
             if target.is_deferred:
                 deferrals = {at: self.openings.deferral(plan, target, source) for at, source in sources.items()}
                 written.deferrals = self._by_source(deferrals)
@@ -183,10 +197,9 @@ class TargetWriter:
         return written
 
     def _destination(self, plan: RoutePlan, target: Target) -> c.Target:
-        endpoint, case = target.label, target.rewrapped or plan.case
-        written = c.Target(
-            sender=self.openings.sender(endpoint), trims=self.program.table.endpoints[endpoint].trim_trailing_zeros
-        )
+        endpoint, case = target.label, target.reply or target.rewrapped or plan.case
+        sender = self.openings.replier(endpoint) if target.reply else self.openings.sender(endpoint)
+        written = c.Target(sender=sender, trims=self.program.table.endpoints[endpoint].trim_trailing_zeros)
         if endpoint in self.boards:
             written.board = self.boards[endpoint]
             if case is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from router import declared as c
 from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, RoutePlan, source_label
@@ -256,7 +257,7 @@ class _Writer:
     def _route(self, plan: RoutePlan) -> c.Route:
         lowered, of_datagrams = self.program.lowered, self.targets.of_datagrams
         topics = [target for target in plan.targets if target.is_topic]
-        destinations = [target for target in plan.targets if not target.is_topic]
+        destinations = [target for target in plan.targets if not target.is_topic and not target.reply]
         route = c.Route(
             sends=of_datagrams(plan, destinations, lowered.to_destinations.get(plan.route)),
             last_message=self.counters.index("route_silence_seconds", plan.route),
@@ -266,11 +267,23 @@ class _Writer:
             route.publishes = of_datagrams(plan, topics, lowered.to_topics[plan.route])
         if plan.route in lowered.order:
             route.order = ctypes.pointer(self.arrays.add(self._ordering(plan.route)))
-        setters, witnesses = [*self.targets.setters(plan)], [*self._witnesses(plan)]
-        route.setters, route.setter_count = self.arrays.array(c.Setter, setters), len(setters)
-        route.witnesses, route.witness_count = self.arrays.array(c.Witness, witnesses), len(witnesses)
-        route.is_watched = bool(setters or witnesses)
+        route.effects = self._effects(plan)
         return route
+
+    def _effects(self, plan: RoutePlan) -> Any:
+        """Write what else is done with each message of a route; None without any."""
+        setters, witnesses = [*self.targets.setters(plan)], [*self._witnesses(plan)]
+        replies = self.targets.replies(plan)
+        if not setters and not witnesses and replies is None:
+            return None
+        effects = c.Effects(
+            setters=self.arrays.array(c.Setter, setters),
+            witnesses=self.arrays.array(c.Witness, witnesses),
+            replies=replies,
+            setter_count=len(setters),
+            witness_count=len(witnesses),
+        )
+        return ctypes.pointer(self.arrays.add(effects))
 
     def _ordering(self, route: str) -> c.Ordering:
         lowered, endpoints = self.program.lowered.order[route], self.program.table.endpoints.values()

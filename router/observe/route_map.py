@@ -19,7 +19,7 @@ from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint
 from router.table.model.gateways import Gateway
 from router.table.model.routes import ANY, ROS, Route
-from router.table.model.targets import Destination, Topic
+from router.table.model.targets import Destination, Reply, Topic
 from router.table.units import duration
 
 COLUMNS = ("from", "payload case", "to")
@@ -133,6 +133,8 @@ def _sources(route: Route, table: RouteTable) -> Iterator[Node]:
 def _targets(route: Route, table: RouteTable) -> Iterator[Node]:
     for destination in route.destinations:
         yield endpoint_node(table.endpoints[destination.endpoint.value], "to", 2)
+    for source in route.sources if route.reply is not None else ():
+        yield endpoint_node(table.endpoints[source.value], "to", 2)
     for topic in route.topics:
         yield Node(f"to:{topic.topic.value}", 2, NodeKind.TOPIC, topic.topic.value, topic.type_name)
 
@@ -155,12 +157,16 @@ def _edges_of(route: Route) -> Iterator[Edge]:
     for destination in route.destinations:
         name = destination.endpoint.value
         yield Edge(case, f"to:@{name}", route.name, name, _condition(destination))
+    if (reply := route.reply) is not None:
+        about = ", ".join(filter(None, (f"reply {reply.case.value}", _condition(reply))))
+        for name in (source.value for source in route.sources):
+            yield Edge(case, f"to:@{name}", route.name, name, about)
     for topic in route.topics:
         name = topic.topic.value
         yield Edge(case, f"to:{name}", route.name, name, _condition(topic))
 
 
-def _condition(target: Destination | Topic) -> str:
+def _condition(target: Destination | Reply | Topic) -> str:
     return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "on_limit")
 
 

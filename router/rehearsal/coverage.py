@@ -151,7 +151,8 @@ def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
         if condition is not None:
             gap = f"no test has a message of {name} that this withholds from {target.label}"
             yield ("filtered", name, target.label), Item("rejection", condition.span, gap)
-        if target.declared.max_rate is not None:
+        declared = route.route.reply if target.reply else target.declared  # which has no default rate
+        if declared is not None and declared.max_rate is not None:
             gap = f"no test exceeds the max_rate of {name} to {target.label}"
             yield ("rate_limited", name, target.label), Item("rejection", target.span, gap)
 

@@ -39,8 +39,8 @@ _ALTERNATIVES: Mapping[str, Mapping[str, Collection[str]]] = {
     },
 }
 """Keys of a route or an endpoint, each with those that it replaces."""
-_WHOLE = ("source", "destinations", "topic", "topics")
-"""Keys of a route that take a single value or a list."""
+_WHOLE = ("source", "destinations", "topic", "topics", "reply")
+"""Keys of a route that are replaced as a whole: they take a single value or a list, or have a short form."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 """Parts of a route or gateway whose keys select their kind."""
 _OBEYED = ("deadman", "obeyed")

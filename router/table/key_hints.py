@@ -24,7 +24,7 @@ from router.table.schema import SCHEMA, SchemaError, keys_of, matches, table_sch
 from router.table.source import in_braces
 from router.table.units import EACH, PERIOD, TOPIC_RATE, meant_quantity
 
-NAME_FIELDS = ("fields", "send")
+NAME_FIELDS = ("fields", "send", "reply")
 """Keys whose mappings contain field names, each with an expression."""
 _ELSEWHERE = {
     "topic": ("name", "ros"),
@@ -216,6 +216,7 @@ _NAMES = {
     "route": "the route",
     "destination": "an item of 'destinations'",
     "topic": "an item of 'topics'",
+    "reply": "'reply'",
     "source_topic": "a topic in 'source'",
     "collect": "'collect'",
     "deadman": "'deadman'",

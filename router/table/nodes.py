@@ -206,7 +206,7 @@ _INDISPENSABLE = frozenset({
 })  # fmt: skip
 """Keys without which a route, topic, destination, deadman, `collect` or gateway is meaningless."""
 
-_WHOLE = ("obeyed",)
+_WHOLE = ("obeyed", "reply")
 """Keys whose mapping is meaningless if any part of it is invalid."""
 
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})

@@ -145,13 +145,14 @@ def _above(entry: Entry, entries: Mapping[str, Entry]) -> str | None:
 def _consequences(errors: list[SchemaError]) -> list[SchemaError]:
     """Return errors that are consequences of another one, which is reported.
 
-    These are all but the first of several lists in a list, and errors below `send` if it has several payload cases or
-    one without fields.
+    These are all but the first of several lists in a list, and errors below `send` or `reply` if it has several payload
+    cases or one without fields.
     """
     empty = [error.path for error in errors if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
     consequences = [error for error in errors if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
-    several = [error.path for error in errors if error.keyword == "maxProperties" and error.path[-1] == "send"]
+    too_many = [error.path for error in errors if error.keyword == "maxProperties"]
+    several = [path for path in too_many if path[-1] in ("send", "reply")]
     consequences += [error for error in errors if error.path[:-1] in several and error.path[:-1] not in groups]
     rows: dict[Path, SchemaError] = {}
     lists = [error for error in errors if error.is_list_in_list]

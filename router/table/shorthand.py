@@ -4,6 +4,7 @@
 |---|---|
 | `topic: imu_data` in a route | `topics: [{topic: imu_data}]` |
 | a topic by name, `topics: [imu_data]` | `topics: [{topic: imu_data}]` |
+| `reply: {pong: {id: id}}` in a route | `reply: {case: pong, fields: {id: id}}` |
 | `qos: sensor_data` | `qos: {profile: sensor_data}` |
 | a key of `defaults` | that key wherever it applies and is missing |
 
@@ -50,6 +51,7 @@ class _Shorthand:
             node = replace(node, entries={**others, "topics": topic})
         node = _changed(node, "topics", lambda topics: _one_or_each(topics, lambda topic: self._topic(_named(topic))))
         node = _changed(node, "source", lambda source: _one_or_each(source, self._topic))
+        node = _changed(node, "reply", _reply)
         return _with(_changed(node, "deadman", self._deadman), self._of_routes)
 
     def gateway(self, node: Node) -> Node:
@@ -86,6 +88,15 @@ def _of_deadmen(defaults: Node | None) -> Entries:
 def _named(node: Node) -> Node:
     """Return a topic as a mapping, also if it is only a name."""
     return _alone("topic", node) if isinstance(node, ScalarNode) else node
+
+
+def _reply(node: Node) -> Node:
+    """Return a reply with the keys `case` and `fields`, also if it is only a payload case with fields."""
+    if not isinstance(node, MappingNode) or "case" in node.entries or len(node.entries) != 1:
+        return node
+    [(name, fields)] = [(entry.key, entry.value) for entry in node.entries.values()]
+    entries = {"case": Entry(_key("case", name.span), name), "fields": Entry(_key("fields", name.span), fields)}
+    return replace(node, entries=entries)
 
 
 def _qos(node: Node) -> Node:

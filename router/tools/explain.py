@@ -202,11 +202,14 @@ def _destination(served: Target, checked: CheckedRoute, everything: Checked, how
         how = how if served.plan else "the payload"
         how = f"{how}, as {held.name}, {around.choice.place(around.name, held)}"
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
-    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
+    what = f"destination {served.label} ({endpoint.address.value}): {how}"
+    if served.reply is not None:
+        what = f"reply to {served.label}, where the datagram came from: {served.reply.name}"
+    yield f"  {what}{trimmed}  ({served.span})"
     yield from _conditions(served, checked.route)
     yield from _mapping(served)
     if board := everything.boards.get(served.label):
-        yield f"    checked for the board: {', '.join(_bounds(board, served.rewrapped or checked.case))}"
+        yield f"    checked for the board: {', '.join(_bounds(board, served.reply or served.rewrapped or checked.case))}"
     yield from _waiting(served)
     if others := [other for other in served.deadmen if other != checked.route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
@@ -247,7 +250,7 @@ def _waiting(served: Target) -> Iterator[str]:
     words = phrases(served.declared)
     if "max_rate" in words and served.declared.on_limit is OnLimit.LATEST:
         yield f"    {words['max_rate']}, {words['on_limit']}"
-    if served.endpoint is not None and served.endpoint.bandwidth is not None:
+    if served.is_deferred and served.endpoint is not None and served.endpoint.bandwidth is not None:
         yield f"    {served.priority.value} within a bandwidth of {served.endpoint.bandwidth} bytes/s"
 
 

@@ -30,7 +30,11 @@ def listed_route(checked: CheckedRoute, program: CompiledTable) -> Iterator[str]
     name = checked.route.name
     if checked.order is not None:
         yield from _order(lowered.order[name], str(checked.order.number.span))
-    for kind, routes in (("destination", lowered.to_destinations), ("topic", lowered.to_topics)):
+    for kind, routes in (
+        ("destination", lowered.to_destinations),
+        ("topic", lowered.to_topics),
+        ("reply to", lowered.replies),
+    ):
         if name in routes:
             route = routes[name]
             yield from _layout(route.layout)

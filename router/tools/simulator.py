@@ -177,7 +177,8 @@ MOST_CHANGES = 100
 class Statistics:
     """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
-    `is_answered`: whether a route forwards what endpoints send (what comes from ROS may not be published yet).
+    `is_answered`: whether a route forwards or answers what endpoints send (what comes from ROS may not be published
+    yet).
     `unsent` are datagrams that the kernel refused to take, and frames for a pty that is full or not open.
     `changes` are those of the boards, the newest last.
     """
@@ -216,7 +217,9 @@ class Simulator:
                 f"{table.path} has TCP connections, which are not simulated",
                 "simulate a table that gives their boards an 'address' and no 'listener'",
             )
-        self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
+        self.statistics = Statistics(
+            is_answered=any(route.sources and (route.destinations or route.reply) for route in table.routes)
+        )
         played = boards(wire, table, deadmen, self.statistics.changes.append, obeys or {})
         self.statistics.inboxes = {name: Inbox(wire, name, played.get(name)) for name in table.endpoints}
         self._wire = wire
@@ -278,7 +281,8 @@ class Simulator:
         receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)
-        self._selector.register(receiver, selectors.EVENT_READ, (receiver, inbox))
+        for opened in {receiver, sender}:  # replies go to the port that the endpoint sends from
+            self._selector.register(opened, selectors.EVENT_READ, (opened, inbox))
         self._senders[endpoint.name] = self._sending(sender, listener)
 
     def _sending(self, sender: socket.socket, listener: str | None) -> Callable[[bytes, str], None]:

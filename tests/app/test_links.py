@@ -134,6 +134,21 @@ def test_frames_of_the_board_are_forwarded_as_datagrams(site: Site) -> None:
         assert counted(router, "link_up", "board") == 1
 
 
+def test_replies_to_the_board_are_frames(site: Site) -> None:
+    site.program()
+    path = site.folder / "table.yaml"
+    replying = "ph_info: {source: board, reply: {ph_info: auto}, deadman: {none: replies move nothing}}"
+    path.write_text(path.read_text().replace("ph_info: {source: board, destinations: [basestation]}", replying))
+    program = check_table(path, {}).program
+    assert program is not None
+    with Router(program) as router:
+        site.board.await_frames(1)
+        site.board.received = b""
+        site.board.send(numbered(7))
+        wait_until(lambda: numbered(7) in site.board.frames())
+        assert counted(router, "datagrams_sent", "ph_info", "board") == 1
+
+
 def test_commands_reach_the_board_as_frames_and_its_deadman_brakes_when_they_stop(site: Site) -> None:
     with Router(site.program()):
         assert site.board.await_frames(1)[0] == BRAKE

@@ -157,7 +157,7 @@ def test_what_cannot_be_extended_is_one_finding(base: Path, text: str, code: Cod
     assert finding.span.line == 1
 
 
-def test_one_target_replaces_as_a_list_does(tmp_path: Path) -> None:
+def test_one_target_replaces_as_a_list_does_and_so_does_a_reply(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text(
         GOOD
         + """\
@@ -165,19 +165,26 @@ def test_one_target_replaces_as_a_list_does(tmp_path: Path) -> None:
     source: any
     topics: {topic: a, type: std_msgs/msg/Int32, max_rate: 1 Hz, when: satellites > 3, fields: {data: satellites}}
     destinations: {endpoint: basestation, when: satellites > 3}
+    reply: {case: ph_info, fields: {ph_value: 1}, when: satellites > 3}
   arm_ctrl: {source: {topic: a, type: comms/msg/A}, destinations: basestation}
 """
     )
     text = """\
 extends: base.yaml
 routes:
-  gps_info: {topics: {topic: b, type: std_msgs/msg/Int32}, destinations: {endpoint: sensor_board}}
+  gps_info:
+    topics: {topic: b, type: std_msgs/msg/Int32}
+    destinations: {endpoint: sensor_board}
+    reply: {imu_info: {}}
   arm_ctrl: {source: {topic: b, type: comms/msg/A}, destinations: basestation}
 """
     routes = {route.name: route for route in good(tmp_path, text).routes}
     [topic], [destination] = routes["gps_info"].topics, routes["gps_info"].destinations
     assert (topic.topic.value, topic.max_rate, topic.when, topic.fields) == ("b", None, None, None)
     assert (destination.endpoint.value, destination.when) == ("sensor_board", None)
+    reply = routes["gps_info"].reply
+    assert reply is not None
+    assert (reply.case.value, reply.when, reply.fields and reply.fields.entries) == ("imu_info", None, ())
     assert [topic.topic.value for topic in routes["arm_ctrl"].source_topics] == ["b"]
 
 

@@ -32,6 +32,9 @@ TO_BOTH = "{timeout: 1s, send: {x: {}}, to: [arm, base], disarmed_by: [y]}"
         ("{source: arm, topics: a}", "{source: arm, topics: [{topic: a}]}"),
         ("{source: arm, topics: [a, {topic: b}]}", "{source: arm, topics: [{topic: a}, {topic: b}]}"),
         ("{source: arm, destinations: base}", "{source: [arm], destinations: [{endpoint: base}]}"),
+        ("{source: arm, reply: {pong: {id: id}}}", "{source: arm, reply: {case: pong, fields: {id: id}}}"),
+        ("{source: arm, reply: {pong: auto}}", "{source: arm, reply: {case: pong, fields: auto}}"),
+        ("{source: arm, reply: {pong: {}}}", "{source: arm, reply: {case: pong, fields: {}}}"),
         ("{source: {topic: a}, destinations: base}", "{source: [{topic: a}], destinations: [base]}"),
         (
             "{source: arm, topic: {topic: a, qos: sensor_data}}",

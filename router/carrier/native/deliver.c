@@ -195,10 +195,10 @@ static bool publish_it(struct thread_env *env, const struct targets *to, const s
     }
 }
 
-/* Note a command that was sent. A datagram that feeds no deadman is in the mirror as it was received. */
+/* Note a command or a reply that was sent. A datagram that feeds no deadman is in the mirror as it was received. */
 static void note_sent(struct actions *actions, const struct thread_env *env, const struct targets *to,
                       const struct target *target, const uint8_t *data, size_t size) {
-    if (to->topic == NO_NAME && !target->feed_count) return;
+    if (to->topic == NO_NAME && !target->feed_count && !target->message.count) return;
     struct action_record action = {.action = ACTION_SENT, .route = to->route, .target = target->id, .topic = to->topic};
     actions_note(actions, env->counters, action, data, size);
 }

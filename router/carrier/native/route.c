@@ -125,10 +125,10 @@ static void report_evidence(struct routing *routing, const struct witness *witne
 }
 
 /* Show the datagram to deadmen that send to its sender. A condition without a result is not met. */
-static void show_to_deadmen(struct routing *routing, const struct route *route, const struct received *received,
+static void show_to_deadmen(struct routing *routing, const struct effects *effects, const struct received *received,
                             const struct datagram *datagram) {
-    for (uint32_t index = 0; index < route->witness_count; index++) {
-        const struct witness *witness = &route->witnesses[index];
+    for (uint32_t index = 0; index < effects->witness_count; index++) {
+        const struct witness *witness = &effects->witnesses[index];
         if (witness->column != received->column || !deadman_is_tripped(witness->deadman)) continue;
         bool obeys = meets_condition(&routing->env.machine, witness, datagram);
         if (deadman_is_shown(routing->env.timers, witness->deadman, witness->endpoint_id, obeys, received->times.oldest))
@@ -136,43 +136,75 @@ static void show_to_deadmen(struct routing *routing, const struct route *route, 
     }
 }
 
-/* Set the states that the datagram sets, and show it to deadmen. */
-static void watch(struct routing *routing, const struct route *route, const struct received *received) {
+/* Return the target that replies to a sender, or NULL. */
+static const struct target *reply_to(const struct replies *replies, uint32_t column) {
+    uint32_t index = replies->by_column[column];
+    return index < replies->to.count ? &replies->to.targets[index] : NULL;
+}
+
+/* Reply to where the datagram came from, through the socket or the link that received it. */
+static void reply(struct routing *routing, const struct replies *replies, const struct received *received,
+                  const struct datagram *datagram) {
+    const struct target *target = reply_to(replies, received->column);
+    if (!target) return;
+    struct message message = {.datagram = datagram, .now = received->now, .times = received->times,
+                              .since = REFUSED_ARRIVAL};
+    if (!received->listener->link) {
+        sender_aim(target->sender, received->address, (uint16_t)received->port);
+        sender_move(target->sender, received->listener->fd, received->listener->fd);
+    }
+    deliver(&routing->env, &replies->to, target, &message);
+}
+
+/* Set the states that the datagram sets, show it to deadmen, and reply. */
+static void take_effect(struct routing *routing, const struct effects *effects, const struct received *received) {
     struct datagram datagram = datagram_of(routing, received);
-    for (uint32_t index = 0; index < route->setter_count; index++) {
-        const struct setter *setter = &route->setters[index];
+    for (uint32_t index = 0; index < effects->setter_count; index++) {
+        const struct setter *setter = &effects->setters[index];
         if (setter->column != received->column) continue;
         bool is_read = read_datagram(&routing->env.machine, setter->to.layout, setter->to.sources, &datagram);
         set_state(&routing->env, setter, is_read, received->times.oldest, received->now);
     }
-    show_to_deadmen(routing, route, received, &datagram);
+    show_to_deadmen(routing, effects, received, &datagram);
+    if (effects->replies) reply(routing, effects->replies, received, &datagram);
 }
 
 /* ---- order ---- */
 
 /* A datagram is out of order, as `numbers` say; or if they are NULL, `order` has no value for this reason. */
-static void lose_of(struct routing *routing, const struct targets *to, int64_t now, int reason, const struct refusal *numbers) {
-    for (uint32_t index = 0; index < to->count; index++) {
-        struct lost_event lost = {.reason = (uint32_t)reason};
-        if (numbers) {
-            lost.refusal = *numbers;
-            lose_message(&routing->env, to, &to->targets[index], now, lost, "");
-        } else {
-            lost.generation = to->generation;
-            lost.place = PLACE_ORDER;
-            lose_refused(&routing->env, to, &to->targets[index], now, lost);
-        }
+static void lose_one(struct routing *routing, const struct targets *to, const struct target *target, int64_t now, int reason,
+                     const struct refusal *numbers) {
+    struct lost_event lost = {.reason = (uint32_t)reason};
+    if (numbers) {
+        lost.refusal = *numbers;
+        lose_message(&routing->env, to, target, now, lost, "");
+    } else {
+        lost.generation = to->generation;
+        lost.place = PLACE_ORDER;
+        lose_refused(&routing->env, to, target, now, lost);
     }
 }
 
-/* Lose it for all targets, and for the states that it would set. Returns false. */
+static void lose_of(struct routing *routing, const struct targets *to, int64_t now, int reason, const struct refusal *numbers) {
+    for (uint32_t index = 0; index < to->count; index++)
+        lose_one(routing, to, &to->targets[index], now, reason, numbers);
+}
+
+static void lose_effects(struct routing *routing, const struct effects *effects, const struct received *received, int reason,
+                         const struct refusal *numbers) {
+    for (uint32_t index = 0; index < effects->setter_count; index++)
+        if (effects->setters[index].column == received->column)
+            lose_of(routing, &effects->setters[index].to, received->now, reason, numbers);
+    const struct target *replying = effects->replies ? reply_to(effects->replies, received->column) : NULL;
+    if (replying) lose_one(routing, &effects->replies->to, replying, received->now, reason, numbers);
+}
+
+/* Lose it for all targets, for the states that it would set, and for its reply. Returns false. */
 static bool lose_for_all(struct routing *routing, const struct route *route, const struct received *received, int reason,
                          const struct refusal *numbers) {
     lose_of(routing, &route->sends, received->now, reason, numbers);
     lose_of(routing, &route->publishes, received->now, reason, numbers);
-    for (uint32_t index = 0; index < route->setter_count; index++)
-        if (route->setters[index].column == received->column)
-            lose_of(routing, &route->setters[index].to, received->now, reason, numbers);
+    if (route->effects) lose_effects(routing, route->effects, received, reason, numbers);
     return false;
 }
 
@@ -306,7 +338,8 @@ static int route(struct routing *routing, const struct payload_case *found, stru
     env_count(&routing->env, choice->received, 1);
     if (chosen->sends.count) send_to_all(routing, &chosen->sends, received);
     if (chosen->publishes.count) hand_over(routing, &chosen->publishes, received);
-    if (chosen->is_watched) watch(routing, chosen, received);
+    if (__builtin_expect(chosen->effects != NULL, 0)) /* the order of the code favours routes without any */
+        take_effect(routing, chosen->effects, received);
     counter_set(routing->env.counters, chosen->last_message, received->now);
     return ROUTED;
 }

@@ -133,6 +133,7 @@ bool sender_note_errors(int listener) {
 static bool note_own_errors(struct sender *sender) {
     struct sockaddr_in address;
     int fd = atomic_load(&sender->fd), refused, read = 0;
+    if (fd == atomic_load(&sender->listener)) return sender_note_errors(fd); /* all senders share it */
     for (; read < MOST_ERRORS && read_error(fd, &address, &refused); read++)
         if (refused) note(sender, refused);
     if (read == MOST_ERRORS) discard_errors(fd);

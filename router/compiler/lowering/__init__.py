@@ -62,11 +62,14 @@ def lower_table(
     from_ros: dict[str, tuple[LoweredFeed, ...]] = {}
     order: dict[str, LoweredOrder] = {}
     obeyed: dict[str, LoweredCondition] = {}
+    replies: dict[str, LoweredRoute] = {}
     findings: list[Diagnostic] = []
     for checked in routes:
-        filtered = [target for target in checked.targets if not target.topic and (target.when or target.rewrapped)]
+        answering = [target for target in checked.targets if target.reply]
+        forwarding = [target for target in checked.targets if not target.topic and not target.reply]
+        filtered = [target for target in forwarding if target.when or target.rewrapped]
         published = [target for target in checked.targets if target.topic]
-        for targets, lowered in ((filtered, to_destinations), (published, to_topics)):
+        for targets, lowered in ((filtered, to_destinations), (published, to_topics), (answering, replies)):
             with _limits_in(findings):
                 if targets:
                     source = Datagram(checked.case, _holder(envelopes, checked.case), names)
@@ -87,7 +90,7 @@ def lower_table(
     values = _lower_states(states, envelopes, findings)
     for topic, of_state in _feeds(states, values):
         from_ros[topic] = (*from_ros.get(topic, ()), of_state)
-    return Lowered(to_destinations, to_topics, from_ros, order, obeyed, values), findings
+    return Lowered(to_destinations, to_topics, from_ros, order, obeyed, values, replies), findings
 
 
 def _lower_states(

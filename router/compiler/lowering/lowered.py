@@ -115,7 +115,8 @@ class Lowered:
 
     For datagrams, by route: `to_destinations` has the destinations with a condition, `to_topics` the topics. `from_ros`
     is by topic, in the order of the table. `order` has the numbers of routes with `order`. `obeyed` has the conditions
-    that show that a deadman's brake is obeyed, by the deadman's route. `states` is by name.
+    that show that a deadman's brake is obeyed, by the deadman's route. `states` is by name. `replies` has the replies
+    of routes with `reply`.
     """
 
     to_destinations: Mapping[str, LoweredRoute]
@@ -124,3 +125,4 @@ class Lowered:
     order: Mapping[str, LoweredOrder]
     obeyed: Mapping[str, LoweredCondition]
     states: Mapping[str, LoweredState]
+    replies: Mapping[str, LoweredRoute]

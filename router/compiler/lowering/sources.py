@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from google.protobuf.descriptor import Descriptor
 
 from router.compiler.checked import CheckedOrder, CheckedRoute, CheckedState, CheckedSubscription, Target
+from router.compiler.compiled_table import Beside
 from router.compiler.expressions import tree
 from router.compiler.expressions.kinds import UINT32, StringKind
 from router.compiler.expressions.states import gate_of, state_name, state_variables
@@ -48,8 +49,8 @@ from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
 MOST_CONDITION_OPERATIONS = 1 << 18
-"""Maximum operations per datagram of a destination's `when`, `order` or a state's value, about a millisecond of the
-receive thread."""
+"""Maximum operations per datagram of a destination's `when`, a reply, `order` or a state's value, about a millisecond
+of the receive thread."""
 
 _MOST_SLOTS = NONE
 
@@ -111,6 +112,12 @@ class _Source:
         _require_small([(operation, node.span) for operation in routine])
         return routine
 
+    def sent(
+        self, lowering: Lowering, plan: Record, case: PayloadCase, beside: Beside | None = None
+    ) -> tuple[Routine, tuple[str, ...]]:
+        """Lower the envelope for an endpoint, with the place of each operation. `beside` precedes the payload."""
+        return _with_places(protobuf_message(lowering, plan, case, beside.data if beside else b""))
+
     def gate(self, target: Target, conditions: Sequence[tree.Node | None]) -> Routine:
         """Lower what a message that was held must still meet when it leaves. Raises TooLargeError."""
         return self.condition(self.lowering(), gate_of(conditions))[0] if target.is_deferred else ()
@@ -157,7 +164,7 @@ class Datagram(_Source):
         self._is_rewrapped = False
 
     def lowered(self, checked: CheckedRoute, targets: Sequence[Target]) -> LoweredRoute:
-        """Lower destinations or topics of a route, which share a layout. Raises TooLargeError."""
+        """Lower destinations, topics or replies of a route, which share a layout. Raises TooLargeError."""
         collect = checked.collect if targets[0].topic else None
         span = checked.route.span
         if collect is None:
@@ -183,13 +190,13 @@ class Datagram(_Source):
         return {target.label: target for target in made}, layout
 
     def _target(self, target: Target, elements: _Elements | None, collect: str) -> Target:
-        """Lower a topic, or a destination, which gets the datagram as received."""
+        """Lower a topic, a reply, or a destination, which gets the datagram as received."""
         lowering = self.lowering()
         splits = ""
         if target.for_each is not None and elements is not None:
             lowering.names.variables |= elements.variables
             splits = f"{target.for_each.span}: for_each"
-        condition, when = self.condition(lowering, [target.when], is_bounded=target.plan is None)
+        condition, when = self.condition(lowering, [target.when], is_bounded=not target.is_topic)
         message, places = self._message(lowering, target)
         gate = self.gate(target, [target.when])
         places = ("", when, collect, splits, *places)
@@ -213,6 +220,10 @@ class Datagram(_Source):
             self._is_rewrapped = True
             beside = target.beside.data if target.beside else b""
             return _with_places(rewrapped(target.rewrapped, beside, target.span))
+        if target.plan is not None and target.reply is not None:
+            message, places = self.sent(lowering, target.plan, target.reply, target.beside)
+            _require_fast(message, target.span, "a reply")
+            return message, places
         return self.published(lowering, target.plan) if target.plan is not None else ((), ())
 
     def published(self, lowering: Lowering, plan: Record) -> tuple[Routine, tuple[str, ...]]:
@@ -247,8 +258,7 @@ class RosMessage(_Source):
             lowering = self.lowering()
             condition, when = self.condition(lowering, [feed.when, target.when])
             assert target.plan is not None  # noqa: S101 - a message of ROS is mapped
-            beside = target.beside.data if target.beside else b""
-            message, places = self.sent(lowering, target.plan, target.rewrapped or checked.case, beside)
+            message, places = self.sent(lowering, target.plan, target.rewrapped or checked.case, target.beside)
             all_places = f"{feed.topic.span}: a malformed message", when, "", place, *places
             gate = self.gate(target, [feed.when, target.when])
             targets[target.label] = replace(target, condition=condition, gate=gate, message=message, places=all_places)
@@ -266,12 +276,6 @@ class RosMessage(_Source):
         """Lower the value of a state. Raises TooLargeError."""
         routine, span, stamp = self._number(state.value), state.value.span, self._stamp(feed.stamp)
         return LoweredState(routine, self.layout(span), f"{span}: state", _indexes(stamp))
-
-    def sent(
-        self, lowering: Lowering, plan: Record, case: PayloadCase, beside: bytes = b""
-    ) -> tuple[Routine, tuple[str, ...]]:
-        """Lower the envelope for a destination, with the place of each operation. `beside` precedes the payload."""
-        return _with_places(protobuf_message(lowering, plan, case, beside))
 
     def _stamp(self, node: tree.Node | None) -> tuple[Slot, ...]:
         """Return the slots of the seconds and nanoseconds of a field with a time; none without a field."""

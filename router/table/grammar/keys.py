@@ -29,7 +29,7 @@ from router.table.model.expressions import Expression, FieldMap
 from router.table.model.gateways import GatewayFormat, InboundDeadman, TopicRate
 from router.table.model.routes import Collect, Deadman, Payload
 from router.table.model.services import CalledReply, ServiceCall, ServiceReply, ServiceRequest, ServiceSource
-from router.table.model.targets import Qos
+from router.table.model.targets import Qos, Reply
 
 Schema = dict[str, Any]
 
@@ -53,7 +53,7 @@ _DEFINED: Mapping[type, str] = {
 }
 """Types of values, and their definitions if these are named differently."""
 _DESCRIBED = (
-    *(Collect, Deadman, FieldMap, InboundDeadman, Qos),
+    *(Collect, Deadman, FieldMap, InboundDeadman, Qos, Reply),
     *(CalledReply, ServiceCall, ServiceReply, ServiceRequest, ServiceSource),
 )
 """Types that are described with their class, for all their keys."""

@@ -20,7 +20,7 @@ from router.table.model.services import (
 )
 from router.table.model.settings import EnvelopeSettings
 from router.table.model.state import State
-from router.table.model.targets import QOS_PROFILES, Destination, Qos, Topic
+from router.table.model.targets import QOS_PROFILES, Destination, Qos, Reply, Topic
 from router.table.model.tcp import TcpClient, TcpServer
 
 _OF_ALL_TOPICS = ("topic", "type", "queue_depth", "qos")
@@ -104,6 +104,19 @@ _OBEYED = key(
     {"drive_diag": "has(front_left_motor) and abs(front_left_motor.rpm) < 5", "within": "2s"},
     must=_MUST_SHOW,
 )
+_REPLY = {
+    **about(Reply),
+    "type": "object",
+    "if": {"required": ["case"]},
+    "then": mapping(properties(Reply)),
+    "else": {
+        "minProperties": 1,
+        "maxProperties": 1,
+        "additionalProperties": ref("fields"),
+        "errorMessage": "must be one payload case with its fields, such as {pong: {id: id}}; with other keys, write "
+        "{case: pong, fields: {id: id}, when: id > 0}",
+    },
+}
 _NO_DEADMAN = key(
     "None", "Why this route has no deadman.", REASON, "the board stops by itself after 1 s without commands",
     must="be a text that says why there is none",
@@ -234,6 +247,7 @@ PARTS: Schema = {
     },
     "collect": part(Collect),
     "destination": _named(Destination, "an endpoint's name or a mapping with 'endpoint'"),
+    "reply": _REPLY,
     "topic": _named(Topic, "a topic's name or a mapping with 'topic'"),
     "qos": _QOS,
     "gateway": {

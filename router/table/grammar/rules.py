@@ -191,6 +191,7 @@ ROUTE: Sequence[Schema] = [
         "then": {"allOf": [
             without("collect", "joins datagrams; it is not allowed if the source is a topic"),
             without("order", "drops datagrams that were overtaken; it is not allowed if the source is a topic"),
+            without("reply", "answers datagrams; it is not allowed if the source is a topic, which has no sender"),
             without("topics?", "publishes, but messages from a topic go to 'destinations'"),
         ]},
         "else": {"allOf": [

@@ -6,7 +6,7 @@ from typing import Annotated
 from router.errors import Located, SourceSpan
 from router.table.keys import Listed, Named, Shape, Words
 from router.table.model.expressions import Expression, FieldMap
-from router.table.model.targets import Destination, Priority, Topic
+from router.table.model.targets import Destination, Priority, Reply, Topic
 from router.table.units import DURATION, Quantity
 
 AT_START = Quantity("at_start", parse=lambda word: word == "send", show=lambda sends: "send" if sends else "silent")
@@ -154,9 +154,9 @@ class Route:
 
     `span` is the payload case in the table, or the first key of a route in a list. `name` is unique, for metrics and
     log: the payload case, or, for one of several routes of a case, a name such as `imu_info_from_ros`. Messages come
-    from `sources`, which are names of endpoints or only `any`, or from `source_topics`. `topics` (published), `order`
-    and `collect` are for the former, `fields` and `for_each` for the latter. `ttl` is in ns. `no_ttl` is the reason why
-    messages of any age may leave, `no_deadman` why a route with commands has no deadman.
+    from `sources`, which are names of endpoints or only `any`, or from `source_topics`. `topics` (published), `reply`,
+    `order` and `collect` are for the former, `fields` and `for_each` for the latter. `ttl` is in ns. `no_ttl` is the
+    reason why messages of any age may leave, `no_deadman` why a route with commands has no deadman.
     """
 
     name: str
@@ -187,6 +187,7 @@ class Route:
     Example: imu_data
     Example: [{topic: imu/data_raw, type: sensor_msgs/msg/Imu}, imu_data]
     """
+    reply: Reply | None = None
     fields: FieldMap | None = None
     ttl: Annotated[Located[int] | None, DURATION, Shape("age_limit"), Words("dropped when older than {}")] = None
     """The greatest age of a message when it is sent or published; older ones are dropped as stale. Default: no limit;

@@ -107,6 +107,43 @@ class Destination(TargetKeys):
     fields: FieldMap | None = None
 
 
+USUAL_REPLY_RATE = 20.0
+"""In Hz."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What the router itself answers: an envelope with the payload `case`, sent to the address and port that the
+    datagram came from. {CASE: FIELDS} is short for {case: CASE, fields: FIELDS}.
+
+    `span` is the key `reply`; `max_rate` is in Hz.
+
+    Example: {pong: {id: id}}
+    Example: {case: connect, fields: {sender: ROVER}, when: sender != Device.ROVER}
+    """
+
+    case: Located[str]
+    """The payload case of the reply.
+
+    Example: pong
+    """
+    span: SourceSpan
+    fields: FieldMap | None = None
+    when: Annotated[Expression | None, Shape("condition"), Words("when {}")] = None
+    """A boolean expression over the received message. Messages for which it is false get no reply, and are counted as
+    filtered.
+
+    Example: sender != Device.ROVER
+    """
+    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
+    """At most this many replies per second to each endpoint, on average; others are dropped as rate_limited. This also
+    ends an exchange between two programs that answer each other's replies. Default: 20 Hz.
+
+    Title: Largest rate
+    Example: 50 Hz
+    """
+
+
 @dataclass(frozen=True, slots=True)
 class Topic(TargetKeys):
     """A ROS topic that is published, with its type, QoS and field mapping; or its name alone.
