@@ -209,7 +209,8 @@ def _destination(served: Target, checked: CheckedRoute, everything: Checked, how
     yield from _conditions(served, checked.route)
     yield from _mapping(served)
     if board := everything.boards.get(served.label):
-        yield f"    checked for the board: {', '.join(_bounds(board, served.reply or served.rewrapped or checked.case))}"
+        sent = served.reply or served.rewrapped or checked.case
+        yield f"    checked for the board: {', '.join(_bounds(board, sent))}"
     yield from _waiting(served)
     if others := [other for other in served.deadmen if other != checked.route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
