@@ -30,7 +30,7 @@ class TcpClient:
     framing: Annotated[StreamFraming, Shape("stream_framing")]
     checksum: Annotated[Checksum | None, Shape("checksum")] = None
     envelope: Located[str] | None = None
-    """Which of the table's `envelopes` its frames have. Needed if there are several.
+    """Which of the table's `envelopes` its frames are. Needed if there are several.
 
     Example: vision
     """
@@ -56,7 +56,7 @@ class TcpServer:
     framing: Annotated[StreamFraming, Shape("stream_framing")]
     checksum: Annotated[Checksum | None, Shape("checksum")] = None
     envelope: Located[str] | None = None
-    """Which of the table's `envelopes` its frames have. Needed if there are several.
+    """Which of the table's `envelopes` its frames are. Needed if there are several.
 
     Example: vision
     """
