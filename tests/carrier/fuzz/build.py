@@ -1,9 +1,10 @@
-"""Build the libFuzzer targets for `envelope_read`, for what becomes of a datagram and for frames, and seeds for them.
+"""Build the libFuzzer targets, and seeds for them: `envelope_read`, what becomes of a datagram, `collect`, framings.
 
     python -m tests.carrier.fuzz.build /tmp/fuzz
     cd /tmp/fuzz && ./envelope_fuzz -runs=100000000 -max_len=400 corpus
     cd /tmp/fuzz && ./handle_fuzz -runs=100000000 -max_len=400 corpus
     cd /tmp/fuzz && ./collect_fuzz -runs=1000000 -max_len=400 corpus
+    cd /tmp/fuzz && ./framing_fuzz -runs=100000000 -max_len=400 corpus
 
 Takes clang with its sanitizers. The folder is made; `corpus` in it grows while the target runs.
 """
@@ -27,7 +28,7 @@ from tests.carrier.fuzz.compiling import HERE, Compile, for_libfuzzer
 
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
 SEEDS_OF_A_SCHEMA = 300
-TARGETS = ("envelope_fuzz", "handle_fuzz", "collect_fuzz")
+TARGETS = ("envelope_fuzz", "handle_fuzz", "collect_fuzz", "framing_fuzz")
 INCLUDED = {"handle_fuzz": "carrier.c", "collect_fuzz": "collect.c"}
 """What a target includes: it stands in the place of that source."""
 
