@@ -80,6 +80,7 @@ GROUPS = {
         "init": "write a first table into a folder",
         "sim": "simulate the boards and the basestation of a table",
         "send": "send envelopes with payloads of your choice",
+        "call": "call a ROS service and print its response",
     },
     "Protocol": {
         "new": "add a message to all files of a rover checkout",

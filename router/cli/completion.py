@@ -1,4 +1,4 @@
-"""Shell completion of words from a table: payload cases and fields, endpoints, listeners, gateways and topics.
+"""Shell completion of words from a table: payload cases, fields, endpoints, listeners, gateways, services, topics.
 
 Most are taken as they are written, without a check of the table. A table that cannot be read gives no words and no
 message: the verb reports the problem.
@@ -101,6 +101,20 @@ def fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
     """Return `accel_x=`, `bbox.x=` or `state=NAME` for the payload case given before."""
     case = getattr(args, "case", None) or args.names[0]
     return _assignments(_wire(args).envelopes.cases[case].type, prefix)
+
+
+def services(args: argparse.Namespace, _: str = "") -> Iterable[str]:
+    """Return the services of the table."""
+    return _names(args, "services")
+
+
+def request_fields(args: argparse.Namespace, prefix: str) -> Iterable[str]:
+    """Return words as `fields` does, for the request of the service named before."""
+    from router.tools.services import halves, services_of
+
+    table = _table(args)
+    type_name = args.type or (services_of(table)[args.service].type_name if table is not None else "")
+    return _assignments(halves(type_name)[0], prefix)
 
 
 def _assignments(kind: MessageType, prefix: str) -> Iterator[str]:

@@ -75,14 +75,19 @@ def usable_class(name: str, definitions: Mapping[str, Definition]) -> Any:
 
 
 def service_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
-    """Return the class of `std_srvs/srv/SetBool`. Raises StartError as `checked_class` does."""
+    """Like `usable_service`, with the position `span` in the StartError."""
     try:
-        _require_same(definitions)
-        package, kind, short = _parts(name)
-        with lazy_import("numpy"):
-            return getattr(importlib.import_module(f"{package}.{kind}"), short)
+        return usable_service(name, definitions)
     except StartError as error:
         raise type(error)(f"{span}: {error.what}", error.hint) from error
+
+
+def usable_service(name: str, definitions: Mapping[str, Definition]) -> Any:
+    """Return the class of `std_srvs/srv/SetBool`. Raises StartError as `usable_class` does."""
+    _require_same(definitions)
+    package, kind, short = _parts(name)
+    with lazy_import("numpy"):
+        return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
 def _require_same(definitions: Mapping[str, Definition]) -> None:

@@ -246,19 +246,22 @@ SHOWN_ELEMENTS = 8
 """Maximum number of elements shown of a list in a ROS message; an image has a million."""
 
 
-def ros_tree(message: Any) -> Mapping[str, Tree]:
-    """Return the fields of an rclpy message that are not zero or empty, and the first elements of lists."""
+def ros_tree(message: Any, *, complete: bool = False) -> Mapping[str, Tree]:
+    """Return the fields of an rclpy message that are not zero or empty, and the first elements of lists.
+
+    `complete`: including those that are zero or empty.
+    """
     tree: dict[str, Tree] = {}
     for name, spelled in message.get_fields_and_field_types().items():
         value = getattr(message, name)
         if not _is_array(value):
-            member = _ros_value(value, spelled)
-            if member and value not in (0, "", b"\0"):
+            member = _ros_value(value, spelled, complete=complete)
+            if complete or (member and value not in (0, "", b"\0")):
                 tree[name] = member
-        elif any(value):
+        elif complete or any(value):
             first = _as_list(value[:SHOWN_ELEMENTS])
-            shown = [_ros_value(element, spelled) for element in first]
-            if not _is_ros_message(first[0]):
+            shown = [_ros_value(element, spelled, complete=complete) for element in first]
+            if not first or not _is_ros_message(first[0]):
                 tree[name] = list_text(shown, len(value), SHOWN_ELEMENTS)
                 continue
             tree.update({f"{name}[{index}]": element for index, element in enumerate(shown) if element})
@@ -267,10 +270,10 @@ def ros_tree(message: Any) -> Mapping[str, Tree]:
     return tree
 
 
-def _ros_value(value: Any, spelled: str) -> Any:
+def _ros_value(value: Any, spelled: str, *, complete: bool) -> Any:
     """Convert a value; `spelled` is the field's type as rclpy spells it: `float`, `sequence<double, 5>`, `uint8[4]`."""
     if _is_ros_message(value):
-        return ros_tree(value)
+        return ros_tree(value, complete=complete)
     octet = value[0] if isinstance(value, bytes) else value
     return plain_text(octet, 64 if "double" in spelled else 32)
 

@@ -14,7 +14,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 from router.errors import UsageError, did_you_mean
-from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type, zero
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type, default_of, zero
 from router.types.protobuf import PayloadCase
 
 # Messages
@@ -26,7 +26,12 @@ def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
 
 
 def assigned(message: Message, kind: MessageType, assignments: Sequence[str]) -> Message:
-    """Set fields of a message by `path=value` words, applied in order. Return it. Raises UsageError.
+    """Set fields of a message by words, as in `members_of`. Return it. Raises UsageError."""
+    return filled(message, members_of(kind, assignments))
+
+
+def members_of(kind: MessageType, assignments: Sequence[str]) -> dict[str, Any]:
+    """Return the fields of a message that `path=value` words set, applied in order. Raises UsageError.
 
     A path is `x`, `bbox.x`, `points[1]`, `boxes[0].x` or `counts[left]`. The key of a map needs quotes, as in
     `counts["a.b"]`, unless it has only letters, digits, `_` and `-`. A list without an index is appended to; `bbox=`
@@ -38,7 +43,23 @@ def assigned(message: Message, kind: MessageType, assignments: Sequence[str]) ->
         if match is None:
             raise UsageError(f"'{assignment}' is not an assignment", f"write {assignment or 'field'}=value")
         _assign(members, kind, match["path"], match["text"])
-    return filled(message, members)
+    return members
+
+
+def completed(kind: Type, value: Any) -> Any:
+    """Return a ROS value with the default of each field, and each element of a list of fixed length, that it lacks."""
+    match kind:
+        case MessageType():
+            return {
+                field.name: completed(field.type, value[field.name])
+                if field.name in value
+                else default_of(field.type, field.default)
+                for field in kind.fields
+            }
+        case List():
+            missing = (kind.length or 0) - len(value)
+            return [completed(kind.element, item) for item in value] + [default_of(kind.element)] * missing
+    return value
 
 
 def filled(message: Message, members: Mapping[str, Any]) -> Message:

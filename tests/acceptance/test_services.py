@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import socket
 import threading
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from router.cli import OK, main
 from router.compiler import check_table
 from tests.acceptance.rover_map import ROUTER
 from tests.acceptance.service_clients import ARM, Service, ServiceClients
@@ -135,6 +137,14 @@ def test_a_board_answers_a_call(link: Link) -> None:
     assert link.outcome("answered") == 2
     for number in (1, 2):  # the route gets them, too
         assert link.board.envelope.FromString(link.place.receive("base")).arm_reply.id == number
+
+
+def test_the_verb_call_prints_what_the_board_answers(link: Link, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["call", "arm", "data=true", "-t", str(link.table)]) == OK
+    assert re.fullmatch(r"/arm responded in [0-9.]+ ms: success=true message=1\n", capsys.readouterr().out)
+    link.board.behave = lambda _: []
+    assert main(["call", "nothing", "-t", str(link.table)]) == OK
+    assert re.fullmatch(r"/nothing responded in [0-9.]+ ms: \(no fields\)\n", capsys.readouterr().out)
 
 
 def test_types_without_fields(link: Link) -> None:

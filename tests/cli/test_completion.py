@@ -73,6 +73,7 @@ BOARDS = ["arm_board", "container_board", "driving_board", "sensor_board"]
         ("router listen topic://imu/", ["//imu/data_raw", "//imu/mag"]),
         ("router listen envelope://ro", ["//rover"]),
         ("router listen udp://8500 --topic /imu/", ["/imu/data_raw", "/imu/mag"]),
+        ("router call --type std_srvs/srv/SetBool x ", ["data="]),
         ("router replay it.mcap --to arm", ["arm_board"]),
         ("router new SensorBoardDose --number 99 --board sen", ["sensor_board"]),
     ],
@@ -94,6 +95,19 @@ def test_a_table_with_errors_completes_what_is_written_in_it(tmp_path: Path) -> 
     assert completed("router explain -t broken.yaml ", tmp_path) == ["gps_info", "imu_info"]
     assert completed("router tap -t broken.yaml --from ", tmp_path) == ["board"]
     assert completed("router send -t broken.yaml imu", tmp_path) == ["imu_info"]
+
+
+def test_services_of_the_table_and_their_fields(tmp_path: Path) -> None:
+    services = """services:
+  home:
+    from: {case: imu_info, source: board}
+    call: {service: get_home, type: std_srvs/srv/SetBool, timeout: 1s}
+    reply: {case: imu_info}
+    on_timeout: {}
+"""
+    (tmp_path / "table.yaml").write_text(BROKEN.replace("PROTOS", shlex.quote(str(PROTOS))) + services)
+    assert completed("router call -t table.yaml h", tmp_path) == ["home"]
+    assert completed("router call -t table.yaml home data=", tmp_path) == ["false", "true"]
 
 
 @pytest.mark.parametrize("text", ["", "][", "envelope: {protos: nowhere, message: A, oneof: b}"])

@@ -19,6 +19,7 @@ ARGUMENTS = {
     "graph": "-o routes.svg",
     "replay": "it.mcap --against other.yaml",
     "send": "battery --to 127.0.0.1:9",
+    "call": "arm",
     "listen": "envelope://9",
     "show": "it.mcap",
     "new": "SensorBoardDose --number 99 --board sensor",

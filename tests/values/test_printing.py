@@ -109,6 +109,20 @@ def test_what_is_not_zero_is_shown_by_its_path(message: Any, expected: list[str]
     assert list(words(ros_tree(message))) == expected
 
 
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (Empty(), []),
+        (Header(), ["stamp.sec=0", "stamp.nanosec=0", "frame_id="]),
+        (Byte(), ["data=0"]),
+        (ByteMultiArray(), ["layout.dim=[]", "layout.data_offset=0", "data=[]"]),
+        (Polygon(points=[Point32(x=1.0)]), ["points[0].x=1", "points[0].y=0", "points[0].z=0"]),
+    ],
+)
+def test_all_fields_are_shown_if_asked(message: Any, expected: list[str]) -> None:
+    assert list(words(ros_tree(message, complete=True))) == expected
+
+
 def test_long_arrays_are_cut() -> None:
     scan = LaserScan(ranges=[1.0] * 360)
     assert list(words(ros_tree(scan))) == ["ranges=[1,1,1,1,1,1,1,1,...](360)"]

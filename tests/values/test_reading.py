@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from router.datagrams import wire_of_protos
 from router.errors import UsageError
+from router.types.model import Field, Float, Int, List, MessageType, String
 from router.types.protobuf import PayloadCase
 from router.values.printing import (
     compact,
     protobuf_tree,
     words,
 )
-from router.values.reading import payload
+from router.values.reading import completed, members_of, payload
 from tests import everything
 
 
@@ -69,6 +70,18 @@ def test_lists_are_appended_to_or_set_by_index_and_later_words_win(every_kind: P
     assert [point.y for point in message.points] == [0, 4]
     assert message.i32 == 2
     assert math.isnan(build(every_kind, "single=nan").single)
+
+
+def test_words_of_a_ros_message_are_completed_with_its_defaults() -> None:
+    point = MessageType("p/msg/Point", (Field("x", Float(64)), Field("y", Float(64), default=2.0)))
+    fields = Field("points", List(point)), Field("pair", List(Int(8, signed=True), length=2)), Field("name", String())
+    kind = MessageType("p/msg/Shape", (*fields, Field("at", point)))
+    assert completed(kind, members_of(kind, ["points[1].x=5", "pair=7"])) == {
+        "points": [{"x": 0.0, "y": 2.0}, {"x": 5.0, "y": 2.0}],
+        "pair": [7, 0],
+        "name": "",
+        "at": {"x": 0.0, "y": 2.0},
+    }
 
 
 @pytest.mark.parametrize(
