@@ -145,7 +145,8 @@ class Services:
             change.services.unused = unused
             self._served, self._calling = served, calling
             self._running = _Running.of(program, change.image.requests())
-            self._calls = Calls(program.services, program.envelopes, self)
+            numbers = self._calls.numbers if self._calls is not None else {}
+            self._calls = Calls(program.services, program.envelopes, self, numbers)
             self._asking = Asking(program.called, self)
         if (served or calling) and self._thread is None:
             self._thread = Thread(self._run, "services")

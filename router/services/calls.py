@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
 from router.compiler.compiled_table import ANSWERED, MOST_CALLS, ServicePlan
@@ -60,15 +61,25 @@ class _Call(Generic[Caller]):
 
 
 class Calls(Generic[Caller]):
-    """The open calls of the services of a table. Not thread-safe."""
+    """The open calls of the services of a table. Not thread-safe.
 
-    def __init__(self, plans: Iterable[ServicePlan], envelopes: Envelopes, effects: Effects[Caller]) -> None:
+    `numbers` are those of an earlier table: a late reply to one of its calls then answers no call of this one.
+    """
+
+    def __init__(
+        self,
+        plans: Iterable[ServicePlan],
+        envelopes: Envelopes,
+        effects: Effects[Caller],
+        numbers: Mapping[str, int] = MappingProxyType({}),
+    ) -> None:
         self._plans = {plan.label: plan for plan in plans}
         self._envelopes = envelopes
         self._effects = effects
         self._open: list[_Call[Caller]] = []
         """The oldest call is first."""
-        self._numbers = dict.fromkeys(self._plans, 0)
+        self.numbers = {label: numbers.get(label, 0) for label in self._plans}
+        """The number of the last call of each service."""
         self._groups: dict[tuple[str, str], list[str]] = {}
         for label, plan in self._plans.items():
             self._groups.setdefault(plan.group, []).append(label)
@@ -150,8 +161,8 @@ class Calls(Generic[Caller]):
         return next((call for call in self._open if call.number == number and call.plan.group == plan.group), None)
 
     def _next(self, label: str) -> int:
-        self._numbers[label] = self._numbers[label] % MOST_CALLS + 1
-        return self._numbers[label]
+        self.numbers[label] = self.numbers[label] % MOST_CALLS + 1
+        return self.numbers[label]
 
     def _end(self, plan: ServicePlan, caller: Caller, outcome: str, began: int, now: int) -> None:
         self._effects.answer(plan, caller, plan.responses[outcome])

@@ -87,6 +87,12 @@ def test_a_request_and_its_reply(stage: Stage) -> None:
     assert "a" not in stage.responses
 
 
+def test_numbers_go_on_after_a_reload(stage: Stage, program: CompiledTable) -> None:
+    stage.call("arm", "a", ARM, data=True)
+    stage.calls = Calls(program.services, program.envelopes, stage, stage.calls.numbers)
+    assert stage.call("arm", "b", ARM, data=True).arm_request.id == 2
+
+
 def test_a_type_without_request_fields_and_a_reply_without_number(stage: Stage) -> None:
     assert stage.call("count", "a", TRIGGER).drive.speed == 1
     stage.reply("count", log={"number": 3})
