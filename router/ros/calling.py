@@ -2,43 +2,22 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from time import monotonic, sleep
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.serialization import deserialize_message
 
 from router.errors import StartError, TransportError, listed
+from router.ros.graph import servers
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.type_support import Definition
 from router.ros.types import usable_service
 
 _LOOK_S = 0.05
 """The time between two looks at the graph, and for which a signal may wait."""
-
-
-class Server(NamedTuple):
-    """A server of a service: the absolute name of its node, and the type of the service there."""
-
-    node: str
-    type_name: str
-
-
-def servers(node: Node) -> Mapping[str, Sequence[Server]]:
-    """Return the servers that `node` has discovered, by the absolute names of their services."""
-    found: dict[str, list[Server]] = defaultdict(list)
-    for name, namespace in sorted(set(node.get_node_names_and_namespaces())):
-        try:
-            offered = node.get_service_names_and_types_by_node(name, namespace)
-        except NodeNameNonExistentError:  # it has gone, or its name is not known yet
-            continue
-        for service, types in offered:
-            found[service] += [Server(f"{namespace.rstrip('/')}/{name}", each) for each in types]
-    return found
 
 
 class ServiceCaller:
@@ -65,9 +44,9 @@ class ServiceCaller:
         """Wait up to `patience` seconds for a server. Raises TransportError if there is none of this type."""
         until = monotonic() + patience
         while True:
-            types = {server.type_name for server in servers(self._node).get(self.name, ())}
-            if self._type_name in types and self._client.service_is_ready():
-                return
+            types = {server.type_name for server in servers(self._node, self.name)}
+            if (self._type_name in types or not types) and self._client.service_is_ready():
+                return  # without types if the middleware is not DDS
             if monotonic() >= until:
                 break
             sleep(_LOOK_S)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from ctypes import c_int, c_void_p
 from dataclasses import dataclass, field, replace
 from time import sleep
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -19,6 +19,8 @@ from router.log import logger
 from router.ros.marks import Router, marks, this_router
 from router.ros.node import close_node, open_node
 from router.ros.rcl import function
+
+T = TypeVar("T")
 
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """The name in the graph until the node of a publisher or subscriber has been discovered."""
@@ -104,12 +106,37 @@ def look(node: Node, ours: Ours) -> Surroundings:
     return Surroundings(dict(mistyped), shared, max(0, nodes.count(ours.node) - known))
 
 
-def look_once(tool: str, program: CompiledTable, seconds: float) -> Surroundings:
-    """Query the graph with a node of this name, `seconds` after opening it. Raises StartError."""
+class Server(NamedTuple):
+    """A server of a service: the absolute name of its node, and the type of the service there."""
+
+    node: str
+    type_name: str
+
+
+def servers(node: Node, service: str) -> Sequence[Server]:
+    """Return the servers of a service, by its absolute name, that `node` has discovered. Only for DDS.
+
+    Each is a subscriber of the topic of requests. Queries by node would miss one of two nodes of the same name.
+    """
+    with node.handle:
+        found = rclpy_implementation.rclpy_get_subscriptions_info_by_topic(node.handle, f"rq{service}Request", True)
+    return [
+        Server(_absolute(each["node_name"], each["node_namespace"]), _service_type(each["topic_type"]))
+        for each in found
+    ]
+
+
+def _service_type(name: str) -> str:
+    """Return `std_srvs/srv/SetBool` for the type of its requests in DDS, `std_srvs::srv::dds_::SetBool_Request_`."""
+    return name.replace("::dds_::", "::").removesuffix("_Request_").replace("::", "/")
+
+
+def look_once(tool: str, seconds: float, look_at: Callable[[Node], T]) -> T:
+    """Query the graph of a node with this name, `seconds` after opening it. Raises StartError."""
     node = open_node(tool)
     try:
         sleep(seconds)
-        return look(node, Ours.of(program))
+        return look_at(node)
     finally:
         close_node(node)
 

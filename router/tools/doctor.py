@@ -40,6 +40,7 @@ from router.tools.line_checks import lines
 from router.tools.multicast_checks import groups
 from router.tools.name_checks import Names
 from router.tools.running_router import Health, health, url_of
+from router.tools.service_checks import services
 
 
 def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
@@ -55,6 +56,8 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     yield from (results := [*ros(program)])
     if running is None and all(result.grade is Grade.FINE for result in results):
         yield from ros_peers(program)
+    if all(result.grade is Grade.FINE for result in results):
+        yield from services(program)
     yield from listeners(program)
     yield from groups(program)
     yield from lines(program, running=running is not None)

@@ -18,7 +18,7 @@ from time import monotonic
 from typing import NamedTuple
 
 from router.assets import asset
-from router.compiler.compiled_table import CompiledTable
+from router.compiler.compiled_table import CalledPlan, CompiledTable, ServicePlan
 from router.compiler.extras import missing_extras, missing_modules
 from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
@@ -425,25 +425,28 @@ def extras(program: CompiledTable) -> Iterator[CheckResult]:
 
 
 def ros(program: CompiledTable) -> Iterator[CheckResult]:
-    plans = (*program.publishers, *program.subscriptions)
-    if not plans and not program.gateways:
+    if not program.uses_ros:
         return
+    plans = (*program.publishers, *program.subscriptions)
+    services: tuple[ServicePlan | CalledPlan, ...] = (*program.services, *program.called)
     problems = [problem("ROS", obstacle.what, obstacle.hint) for obstacle in obstacles(os.environ)]
     yield from problems
     if problems:  # loading it would end this process
         return
     try:
         from router.ros.node import middleware
-        from router.ros.types import usable_class
+        from router.ros.types import usable_class, usable_service
     except ImportError as error:
-        yield problem("ROS", f"the table has topics, but ROS 2 cannot be loaded: {error}", ros_remedy())
+        yield problem("ROS", f"the table needs ROS 2, which cannot be loaded: {error}", ros_remedy())
         return
     wrong: dict[str, dict[str, StartError]] = {}
-    for plan in plans:
+    used = [(usable_class, plan.type_name, plan.definitions) for plan in plans]
+    used += [(usable_service, plan.type_name, plan.definitions) for plan in services]
+    for load_type, name, definitions in used:
         try:
-            usable_class(plan.type_name, plan.definitions)
+            load_type(name, definitions)
         except StartError as error:
-            wrong.setdefault(plan.type_name.partition("/")[0], {})[plan.type_name] = error
+            wrong.setdefault(name.partition("/")[0], {})[name] = error
     for package, errors in wrong.items():
         first = next(iter(errors.values()))
         more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
@@ -452,8 +455,10 @@ def ros(program: CompiledTable) -> Iterator[CheckResult]:
     yield from (problem("ROS", peer.what, peer.hint) for peer in unresolved)
     if not wrong and not unresolved:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        types = plural(len({plan.type_name for plan in plans}), "message type")
-        yield fine("ROS", f"{middleware()} in domain {domain}, and {types} of the table")
+        types = [plural(len({plan.type_name for plan in plans}), "message type")]
+        if services:
+            types.append(plural(len({plan.type_name for plan in services}), "service type"))
+        yield fine("ROS", f"{middleware()} in domain {domain}, and {listed(types)} of the table")
 
 
 DISCOVERY_S = 2.0
@@ -464,10 +469,10 @@ def ros_peers(program: CompiledTable) -> Iterator[CheckResult]:
     """Warn of what a router would meet in the ROS domain: another router, and peers of another type."""
     if not program.uses_ros:
         return
-    from router.ros.graph import look_once
+    from router.ros.graph import Ours, look, look_once
 
     try:
-        others = look_once("router_doctor", program, DISCOVERY_S)
+        others = look_once("router_doctor", DISCOVERY_S, lambda node: look(node, Ours.of(program)))
     except StartError as error:
         yield problem("ROS", error.what, error.hint)
         return

@@ -78,7 +78,7 @@ def test_a_service_that_nobody_offers(capsys: pytest.CaptureFixture[str], table:
 
 
 def test_a_server_of_another_type(server: ServiceServer, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["/loki/get_home", "--type", "std_srvs/srv/Trigger", "--timeout", "1s"]
+    words = ["/loki/get_home", "--type", "std_srvs/srv/Trigger", "--timeout", "3s"]
     assert main(["call", *words]) == NETWORK_FAULT
     told = f"router call: the server of /loki/get_home has the type {TYPE}, not std_srvs/srv/Trigger\n"
     assert capsys.readouterr().err == told
@@ -86,9 +86,10 @@ def test_a_server_of_another_type(server: ServiceServer, capsys: pytest.CaptureF
 
 def test_a_server_that_does_not_respond(capsys: pytest.CaptureFixture[str]) -> None:
     with ServiceServer("slow") as slow:
-        slow.wait(1)
-        assert main(["call", "slow", "--type", TYPE, "--timeout", "500ms"]) == NETWORK_FAULT
-    assert capsys.readouterr().err == "router call: /slow did not respond within 0.5 s\n"
+        slow.wait(60)
+        assert main(["call", "slow", "--type", TYPE, "--timeout", "3s"]) == NETWORK_FAULT
+        slow.kill()
+    assert capsys.readouterr().err == "router call: /slow did not respond within 3 s\n"
 
 
 @pytest.mark.parametrize(
