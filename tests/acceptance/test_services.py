@@ -252,6 +252,16 @@ def test_a_reload_ends_open_calls_and_the_next_are_answered(link: Link) -> None:
     assert link.clients.call(ARM, ON)["success"]
 
 
+def test_numbers_go_on_after_a_reload(link: Link) -> None:
+    """So a late reply to a call that the reload has ended answers no other call."""
+    assert link.clients.call(ARM, ON)["message"] == "1"
+    link.table.write_text(link.table.read_text().replace("timeout: 60s", "timeout: 59s"))
+    link.router.process.send_signal(signal.SIGHUP)
+    wait_until(lambda: bool(link.router.events("table reloaded")), "the reload")
+    assert link.clients.call(ARM, ON)["message"] == "2"
+    assert [request.req_id for request in link.board.requests] == [1, 2]
+
+
 def test_a_reload_removes_and_adds_services(link: Link) -> None:
     text = link.table.read_text()
     assert link.clients.call(ARM, ON)["success"]
