@@ -27,8 +27,9 @@ CHANGES_SHOWN = 3
 
 _DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Lists have
 as many elements as the table's mappings need. Boards obey commands, halt when a deadman stops them, and stop after a
-second without commands. The endpoints' addresses must belong to this computer, as in routes/sim.yaml. A board on a
-serial line is at a pty, at the path of the device: nothing may be there."""
+second without commands. Endpoints reply to the requests of services. The endpoints' addresses must belong to this
+computer, as in routes/sim.yaml. A board on a serial line is at a pty, at the path of the device: nothing may be
+there."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",
@@ -84,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
         args.seed,
         args.speed,
         deadmen=program.deadmen,
+        services=program.services,
         silences=silences,
         obeys=obeys,
         lengths=needed_lengths(checked.routes),

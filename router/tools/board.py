@@ -279,16 +279,19 @@ class Inbox:
         self.arrivals: dict[str, Arrivals] = {}
         self.frames: dict[str, Frames] = {}
         self.undecodable = 0
+        self.endpoint = endpoint
         self._wire, self._envelope = wire, wire.envelopes.to(endpoint)
 
-    def take(self, now: float, datagram: bytes) -> None:
+    def take(self, now: float, datagram: bytes) -> Sequence[Decoded]:
+        """Process a received datagram, and return its messages."""
         try:
             found = self._wire.decode_all(datagram, self._envelope)
         except DecodeError:
             self.undecodable += 1
-            return
+            return ()
         for decoded in found:
             self._take(now, decoded)
+        return found
 
     def _take(self, now: float, decoded: Decoded) -> None:
         case, message = decoded.case, decoded.message

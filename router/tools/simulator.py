@@ -1,7 +1,7 @@
 """All boards and the basestation of a route table on one machine, over real UDP and serial lines.
 
-Each endpoint binds its own address, sends the payload cases that have it as their source, and receives. At the other
-end of a serial line, it is a pty in the place of the line's device.
+Each endpoint binds its own address, sends the payload cases that have it as their source, receives, and replies to the
+requests of services. At the other end of a serial line, it is a pty in the place of the line's device.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from router.compiler.compiled_table import DeadmanPlan
+from router.compiler.compiled_table import DeadmanPlan, ServicePlan
 from router.compiler.expressions.tree import ENVELOPE, MESSAGE
 from router.compiler.resolution import stand_in
-from router.datagrams import Wire
+from router.datagrams import Decoded, Wire
 from router.errors import UsageError, did_you_mean, listed
 from router.table.addresses import Address, SerialPlace
 from router.table.model import RouteTable
@@ -31,6 +31,7 @@ from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
 from router.tools.links import Pty
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
+from router.tools.sim_replies import Reply, replies
 from router.tools.udp import LOOPBACK, listener_address, located, open_udp
 from router.types.model import Int, MessageType
 from router.types.paths import type_at
@@ -80,8 +81,8 @@ class Silence:
     start: float
     end: float
 
-    def covers(self, stream: Stream, at: float) -> bool:
-        return self.start <= at < self.end and self.name in (stream.endpoint, stream.case.name)
+    def covers(self, sent: Stream | Reply, at: float) -> bool:
+        return self.start <= at < self.end and self.name in (sent.endpoint, sent.case.name)
 
 
 def parse_silence(text: str) -> Silence:
@@ -112,9 +113,9 @@ def parse_obedience(texts: Iterable[str]) -> dict[str, frozenset[str]]:
     return obeys
 
 
-def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
+def check_silences(silences: Collection[Silence], sent: Iterable[Stream | Reply]) -> None:
     """Raise UsageError for a name that is neither a sender nor a payload case that is sent."""
-    known = {name for stream in streams for name in (stream.endpoint, stream.case.name)} - {STRANGER}
+    known = {name for each in sent for name in (each.endpoint, each.case.name)} - {STRANGER}
     for silence in silences:
         if silence.name not in known:
             hint = did_you_mean(silence.name, known)
@@ -194,8 +195,9 @@ class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
     Raises UsageError if one cannot be bound or opened, and for a table without listeners, or with TCP connections.
-    `deadmen` are those of the compiled program; boards halt on what they send. Boards in `obeys` obey these payload
-    cases only. `lengths` are those of lists that mappings need (`lengths.needed_lengths`).
+    `deadmen` and `services` are those of the compiled program: boards halt on what deadmen send, and endpoints reply to
+    the requests of services. Boards in `obeys` obey these payload cases only. `lengths` are those of lists that
+    mappings need (`lengths.needed_lengths`).
     """
 
     def __init__(
@@ -206,6 +208,7 @@ class Simulator:
         speed: float = 1.0,
         *,
         deadmen: Sequence[DeadmanPlan] = (),
+        services: Sequence[ServicePlan] = (),
         silences: Sequence[Silence] = (),
         obeys: Mapping[str, Collection[str]] | None = None,
         lengths: Mapping[str, int] | None = None,
@@ -227,7 +230,11 @@ class Simulator:
         self._streams = tuple(streams(wire, table, seed, speed))
         self._numbers = [0] * len(self._streams)
         self._silences = silences
-        check_silences(silences, self._streams)
+        self._replies = [
+            (reply, PayloadModel(reply.case.name, reply.case.type, seed, lengths))
+            for reply in replies(wire, table, services)
+        ]
+        check_silences(silences, [*self._streams, *(reply for reply, _ in self._replies)])
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed, lengths) for stream in self._streams]
         self._selector = selectors.DefaultSelector()
         self._opened: list[socket.socket | Pty] = []
@@ -260,7 +267,9 @@ class Simulator:
         rate = sum(stream.rate for stream in self._streams)
         first, ptys = [*self._routers.values()][:1], self._ptys.values()
         to = listed([*map(str, first), *(f"the pty {pty.device}" for pty in ptys)])
-        return f"{who} {what}, {rate:.0f}/s, to {to}"
+        requests = sorted({reply.request for reply, _ in self._replies})
+        answers = f", and replies to {listed(requests)}" if requests else ""
+        return f"{who} {what}, {rate:.0f}/s, to {to}{answers}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`.
@@ -348,7 +357,7 @@ class Simulator:
             wake = min(now + PATIENCE, next_report, *(at for at, _ in due[:1]))
             for key, _ in self._selector.select(max(0.0, wake - (time.monotonic() - start))):
                 receiver, inbox = key.data
-                self._receive(receiver, inbox, time.monotonic() - start)
+                self._receive(receiver, inbox, time.monotonic() - start, epoch)
             now = time.monotonic() - start
             for inbox in self.statistics.inboxes.values():
                 inbox.advance(now)
@@ -369,12 +378,27 @@ class Simulator:
         if stream.numbered is not None:
             self._numbers[index] += 1
             stream.numbered.set(around if stream.numbered.is_beside else message, self._numbers[index])
+        self._transmit(stream, message, around)
+
+    def _reply(self, endpoint: str, request: Decoded, at: float, epoch: float) -> None:
+        for reply, model in self._replies:
+            if (reply.asked, reply.request) != (endpoint, request.case.name):
+                continue
+            if any(silence.covers(reply, at) for silence in self._silences):
+                continue
+            message = reply.case.message_class()
+            model.fill(message, self._pose(reply.endpoint, at, epoch))
+            around = self._wire.envelopes.of(reply.case.name).message_class()
+            reply.copy_number(request, message, around)
+            self._transmit(reply, message, around)
+
+    def _transmit(self, sent: Stream | Reply, message: Any, around: Any) -> None:
         try:
-            self._senders[stream.endpoint](self._wire.encode(stream.case, message, around), stream.case.name)
+            self._senders[sent.endpoint](self._wire.encode(sent.case, message, around), sent.case.name)
         except OSError:
             self.statistics.unsent += 1
         else:
-            self.statistics.sent[stream.endpoint][stream.case.name] += 1
+            self.statistics.sent[sent.endpoint][sent.case.name] += 1
 
     def _pose(self, endpoint: str, at: float, epoch: float) -> Pose:
         """Return the rover's pose as an endpoint reports it: the motors of a board that has halted do not turn."""
@@ -390,18 +414,18 @@ class Simulator:
                 del self._unopened[pty]
                 self._selector.register(pty, selectors.EVENT_READ, (pty, inbox))
 
-    def _receive(self, receiver: socket.socket | Pty, inbox: Inbox, now: float) -> None:
+    def _receive(self, receiver: socket.socket | Pty, inbox: Inbox, now: float, epoch: float) -> None:
         if isinstance(receiver, Pty):
-            self._receive_frames(receiver, inbox, now)
+            self._receive_frames(receiver, inbox, now, epoch)
             return
         for _ in range(DRAIN):
             try:
                 data = receiver.recv(LARGEST_DATAGRAM)
             except BlockingIOError:
                 return
-            inbox.take(now, data)
+            self._take(inbox, data, now, epoch)
 
-    def _receive_frames(self, pty: Pty, inbox: Inbox, now: float) -> None:
+    def _receive_frames(self, pty: Pty, inbox: Inbox, now: float, epoch: float) -> None:
         try:
             frames = pty.receive()
         except OSError:  # nobody has it open any more
@@ -412,4 +436,8 @@ class Simulator:
             if frame.problem:
                 inbox.undecodable += 1
             else:
-                inbox.take(now, frame.data)
+                self._take(inbox, frame.data, now, epoch)
+
+    def _take(self, inbox: Inbox, datagram: bytes, now: float, epoch: float) -> None:
+        for decoded in inbox.take(now, datagram):
+            self._reply(inbox.endpoint, decoded, now, epoch)
