@@ -15,6 +15,7 @@ from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError, plural
 
 if TYPE_CHECKING:
+    from router.observe.services import ServiceReading
     from router.observe.states import StateReading
 
 DEGRADED = 3
@@ -33,7 +34,7 @@ def add_parser(subparsers: Subparsers) -> None:
     examples = ("router status", "router status --json", _UNTIL_IT_RUNS)
     parser = add_verb(subparsers, "status", _DESCRIPTION, *examples)
     add_router_options(parser)
-    has = "a JSON object: state, url, problems, states, learned, received"
+    has = "a JSON object: state, url, problems, states, services, learned, received"
     parser.add_argument("--json", action="store_true", help=has)
 
 
@@ -43,19 +44,22 @@ def run(args: argparse.Namespace) -> int:
     url = running_url(args)
     received = None
     states: Sequence[StateReading] = ()
+    services: Sequence[ServiceReading] = ()
     learned: Mapping[str, str] = {}
     try:
-        *_, received, states, learned, problems = answer = health(url)
+        *_, received, states, services, learned, problems = answer = health(url)
         state, code = ("degraded", DEGRADED) if answer.is_degraded else ("running", OK)
     except TransportError as error:
         state, code, problems = "down", NETWORK_FAULT, (down(url, error),)
     if args.json:
         listed = [problem.json() for problem in problems]
         shown = [asdict(each) for each in states]
-        known = {"state": state, "url": url, "problems": listed, "states": shown, "learned": learned}
-        print(json.dumps({**known, "received": received}))
+        called = [asdict(each) for each in services]
+        known = {"state": state, "url": url, "problems": listed, "states": shown}
+        print(json.dumps({**known, "services": called, "learned": learned, "received": received}))
     else:
         details = [*(problem.text for problem in problems), *(f"{each.name} is {each.value}" for each in states)]
+        details += [f"service {each.name}: {each.text}" for each in services]
         details += [f"{name} is at {address}" for name, address in learned.items()]
         if received is not None:
             details.append(f"{plural(received, 'datagram')} received")

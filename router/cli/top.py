@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 ORDERS = ("table", "rate", "drops", "age", "latency")
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
 the time since the last one, and the latency, median (p50) and 99th percentile (p99). Problems, the values of states,
-and when each endpoint was last heard, come first. `!` marks what is wrong now; `+2` means that two targets do not fit.
-Without drops there is a `-`, or `none accepted` where a deadman sends because the route accepts no command. On a
-terminal the display is live; keys sort and scroll it."""
+calls of services, and when each endpoint was last heard, come first. `!` marks what is wrong now; `+2` means that two
+targets do not fit. Without drops there is a `-`, or `none accepted` where a deadman sends because the route accepts
+no command. On a terminal the display is live; keys sort and scroll it."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

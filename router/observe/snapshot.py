@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -84,3 +85,21 @@ def parse_metrics(text: str, at: float) -> Snapshot:
     from prometheus_client.parser import text_string_to_metric_families
 
     return snapshot(text_string_to_metric_families(text), at)
+
+
+def quantile(counts: Mapping[float, float], part: float) -> float | None:
+    """Return the quantile `part` of a histogram, interpolated in its bucket. `counts`: values up to each bound.
+
+    `inf` if it is beyond the last bound, None if there are no values.
+    """
+    bounds = sorted(counts)
+    if not bounds or counts[bounds[-1]] <= 0:
+        return None
+    rank = part * counts[bounds[-1]]
+    lower, below = 0.0, 0.0
+    for bound in bounds:
+        if counts[bound] >= rank:
+            inside = counts[bound] - below
+            return lower + (bound - lower) * (rank - below) / inside if math.isfinite(bound) and inside else bound
+        lower, below = bound, counts[bound]
+    return math.inf

@@ -11,6 +11,7 @@ from router.compiler.metrics import INTENDED_REASONS
 from router.observe.last_values import LastValues
 from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
+from router.observe.services import METRICS, ServiceReading, service_readings
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot
 from router.observe.states import StateReading, state_readings
 from router.observe.watch import Health
@@ -85,6 +86,7 @@ class Status:
             "ready": running.is_ready,
             **numbers(reading := running.read(now)),
             "states": [_state_json(state) for state in state_readings(program, reading)],
+            "services": [_service_json(service) for service in service_readings(reading)],
             "problems": [problem.json() for problem in self._health.look().problems],
             "values": self._values.of(program),
         }
@@ -98,12 +100,13 @@ class Status:
 
         `learned`: learned addresses, by endpoint.
         """
-        health = self._health.look()
+        health, calls = self._health.look(), self._running.read(boottime_ns(), METRICS)
         return {
             "name": health.program.table.path.name,
             "table": health.program.table.sha256,
             "received": health.now.total("datagrams_received"),
             "states": [asdict(state) for state in health.states],
+            "services": [asdict(service) for service in service_readings(calls)],
             "learned": dict(health.learned),
             "problems": [problem.json() for problem in health.problems],
         }
@@ -157,6 +160,10 @@ def numbers(now: Snapshot) -> Json:
 
 def _state_json(state: StateReading) -> Json:
     return {"name": state.name, "value": state.value, "origin": state.origin}
+
+
+def _service_json(service: ServiceReading) -> Json:
+    return {"name": service.name, "text": service.text}
 
 
 def _steps(metric: str, path: str) -> tuple[str | int, ...]:

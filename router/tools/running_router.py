@@ -16,6 +16,7 @@ from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
 from router.observe.problems import Kind, Problem
+from router.observe.services import ServiceReading
 from router.observe.states import StateReading
 
 if TYPE_CHECKING:
@@ -41,13 +42,14 @@ class Answer(NamedTuple):
 class Health(NamedTuple):
     """What is wrong with a router, which table it runs (file name and SHA-256), and the datagrams it has received.
 
-    `states` are those of the table, `learned` the learned addresses, by endpoint.
+    `states` and `services` are those of the table, `learned` the learned addresses, by endpoint.
     """
 
     name: str
     table_sha256: str
     received: int
     states: tuple[StateReading, ...]
+    services: tuple[ServiceReading, ...]
     learned: Mapping[str, str]
     problems: tuple[Problem, ...]
 
@@ -106,9 +108,10 @@ def health(url: str) -> Health:
     try:
         answer = json.loads(text)
         states = tuple(StateReading(**state) for state in answer["states"])
+        services = tuple(ServiceReading(**service) for service in answer["services"])
         problems = tuple(map(Problem.of, answer["problems"]))
         learned = {name: str(address) for name, address in answer["learned"].items()}
-        return Health(answer["name"], answer["table"], answer["received"], states, learned, problems)
+        return Health(answer["name"], answer["table"], answer["received"], states, services, learned, problems)
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise TransportError(f"what answers at {url}/health.json is not a router of this version") from error
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 from router.compiler.metrics import INTENDED_REASONS
 from router.observe.problems import DROPS, Kind, Level, Problem
-from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
+from router.observe.services import ServiceReading, service_readings
+from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot, quantile
 from router.observe.states import StateReading
 
 WINDOW = 4.0
@@ -108,6 +109,7 @@ class View:
     problems: tuple[str, ...] = ()
     calm: tuple[str, ...] = ()
     states: tuple[StateReading, ...] = ()
+    services: tuple[ServiceReading, ...] = ()
 
 
 class Window:
@@ -164,6 +166,7 @@ def view(
         problems=tuple(problem.text for problem in problems if problem.kind.level is not Level.CALM),
         calm=tuple(problem.text for problem in problems if problem.kind.level is Level.CALM),
         states=tuple(states),
+        services=tuple(service_readings(after)),
     )
 
 
@@ -255,21 +258,3 @@ def _new_latencies(before: Mapping[float, float], after: Mapping[float, float]) 
     """Return latencies between the snapshots; all of `after` if there are none, or if the router was restarted."""
     between = {bound: count - before.get(bound, 0.0) for bound, count in after.items()}
     return between if between.get(math.inf, 0.0) > 0 and min(between.values()) >= 0 else after
-
-
-def quantile(counts: Mapping[float, float], part: float) -> float | None:
-    """Return the quantile `part` of a histogram, interpolated in its bucket. `counts`: values up to each bound.
-
-    `inf` if it is beyond the last bound, None if there are no values.
-    """
-    bounds = sorted(counts)
-    if not bounds or counts[bounds[-1]] <= 0:
-        return None
-    rank = part * counts[bounds[-1]]
-    lower, below = 0.0, 0.0
-    for bound in bounds:
-        if counts[bound] >= rank:
-            inside = counts[bound] - below
-            return lower + (bound - lower) * (rank - below) / inside if math.isfinite(bound) and inside else bound
-        lower, below = bound, counts[bound]
-    return math.inf

@@ -152,7 +152,8 @@ def _summary(view: View, width: int, problem_lines: int, endpoint_lines: int) ->
     totals = [whole] if len(whole) <= width else [flow, losses]
     lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
     lines += _problems(view, width, problem_lines)
-    return [*lines, *_states(view, width, endpoint_lines), *_last_heard(view, width, endpoint_lines)]
+    lines += [*_states(view, width, endpoint_lines), *_services(view, width, endpoint_lines)]
+    return [*lines, *_last_heard(view, width, endpoint_lines)]
 
 
 def _problems(view: View, width: int, most: int) -> list[Text]:
@@ -177,6 +178,10 @@ def _states(view: View, width: int, most: int) -> list[Text]:
 
 def _state(state: StateReading) -> Text:
     return Text.assemble(f"{state.name} ", (state.value, "cyan"), (f", {state.origin}", "dim"))
+
+
+def _services(view: View, width: int, most: int) -> list[Text]:
+    return _columns("service", [Text(f"{each.name}: {each.text}") for each in view.services], width, most)
 
 
 def _last_heard(view: View, width: int, most: int) -> list[Text]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import pytest
 
 from router.cli import NETWORK_FAULT, OK, main
 from router.cli.status import DEGRADED
 from router.observe.problems import Kind, Problem
+from router.observe.services import ServiceReading
 from router.observe.states import StateReading
 from tests.tools.answering import answering
 
@@ -66,6 +68,17 @@ def test_the_line_has_the_states_of_the_table(capsys: pytest.CaptureFixture[str]
         assert main(["status", "--url", url, "--json"]) == OK
     [state] = json.loads(capsys.readouterr().out)["states"]
     assert state == {"name": "mode", "value": "MODE_AUTO", "setter": "basestation", "age": 0.5, "is_valid": True}
+
+
+def test_the_line_has_the_calls_of_services(capsys: pytest.CaptureFixture[str]) -> None:
+    arm = ServiceReading("arm", 1, {"answered": 3, "timed_out": 2}, 0.0125, None)
+    with answering("", services=[arm]) as url:
+        assert main(["status", "--url", url]) == OK
+        calls = "service arm: 1 open, 3 answered, 2 timed_out, median 12.5 ms, some over 5 s"
+        assert capsys.readouterr().out.replace("\n", " ") == f"running: {calls}; 7 datagrams received "
+        assert main(["status", "--url", url, "--json"]) == OK
+    [service] = json.loads(capsys.readouterr().out)["services"]
+    assert service == asdict(arm)
 
 
 def test_the_line_has_the_learned_addresses(capsys: pytest.CaptureFixture[str]) -> None:

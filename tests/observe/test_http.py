@@ -130,6 +130,7 @@ def test_what_is_wrong_is_told_in_words_and_for_programs(
         "table": running.program.table.sha256,
         "received": 7,
         "states": [],
+        "services": [],
         "learned": {},
         "problems": [],
     }

@@ -15,7 +15,7 @@ import pytest
 from router.clock import boottime_ns
 from router.compiler import check_table
 from router.observe import responses
-from router.tools.top import quantile
+from router.observe.snapshot import quantile
 from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
 from tests.gateway.browser import Browser, Page

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 from router.observe.problems import Problem
+from router.observe.services import ServiceReading
 from router.observe.states import StateReading
 
 COLLECTED_AT = 1_500_000_000.25
@@ -23,6 +24,7 @@ def answering(
     status: int = 200,
     problems: Sequence[Problem] = (),
     states: Sequence[StateReading] = (),
+    services: Sequence[ServiceReading] = (),
     learned: Mapping[str, str] | None = None,
     table: str = "",
     health: str | None = None,
@@ -35,6 +37,7 @@ def answering(
         listed = [problem.json() for problem in problems]
         shown = [asdict(state) for state in states]
         known = {"name": "rover.yaml", "table": table, "received": 7, "states": shown, "learned": learned or {}}
+        known |= {"services": [asdict(service) for service in services]}
         health = json.dumps({**known, "problems": listed})
     answers = {"/metrics": text, "/health.json": health}
 

@@ -14,9 +14,10 @@ from rich.console import Console
 
 from router.compiler.metrics import LATENCY_BOUNDS_NS
 from router.observe.problems import Kind, Problem
-from router.observe.snapshot import Counts, Snapshot, parse_metrics
+from router.observe.services import ServiceReading
+from router.observe.snapshot import Counts, Snapshot, parse_metrics, quantile
 from router.observe.states import StateReading
-from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
+from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, view
 from router.tools.top_view import Page, Screen, keys, latency_text, reasons_text, targets_text
 from router.values.printing import age_text
 
@@ -186,6 +187,12 @@ def test_each_state_has_its_value_and_what_set_it() -> None:
         "is_armed false, never set",
     ]
     assert "and 2 more" in printed(Screen(replace(FULL, states=states), "title", Order.TABLE, 12), 60)[first + 1]
+
+
+def test_each_service_has_its_calls() -> None:
+    arm = ServiceReading("arm", 1, {"answered": 3}, 0.012, 0.02)
+    lines = printed(Screen(replace(FULL, services=(arm,)), "title", Order.TABLE, 24), 80)
+    assert "service arm: 1 open, 3 answered, median 12 ms, at most 20 ms" in [line.rstrip() for line in lines]
 
 
 def test_endpoints_without_room_are_counted() -> None:
