@@ -793,10 +793,17 @@ state:
   mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: 5s}}
   selected: {{case: object_selection, source: basestation, value: object_id, initial: 0}}
   driver: {{topic: driver, type: std_msgs/msg/String, value: data, initial: "''"}}
+services:
+  measure:
+    type: std_srvs/srv/Trigger
+    request: {{case: rock_measure_result, to: basestation, fields: {{width_cm: "1"}}, ttl: 1s}}
+    reply: {{case: rock_measure_request, fields: {{success: "true"}}}}
+    timeout: 1s
+    on_timeout: {{success: false, message: reason}}
 """
 
 
-def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tmp_path: Path) -> None:
+def test_states_and_services_have_tiles_at_every_size(browser: Browser, tmp_path: Path) -> None:
     table = tmp_path / "states.yaml"
     table.write_text(STATES)
     program = check_table(table).program
@@ -804,6 +811,7 @@ def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tm
     running = FakeRunning(program)
     running.count("state", "mode", to=1)
     running.count("state_set_seconds", "mode", "basestation", to=boottime_ns())
+    running.count("service_calls", "measure", "timed_out", to=2)
     running.texts["driver"] = "the operator on the second floor"
     with closing(served(running, save)) as server:
         page = open_page(browser, f"http://{server.address}/")
@@ -814,7 +822,8 @@ def test_states_have_tiles_with_what_set_them_at_every_size(browser: Browser, tm
             found += accessibility.problems(page) + accessibility.cut_texts(page) + accessibility.overflows(page)
         page.close()
     running.mirror.close()
-    assert [re.sub(r"[\d.]+ s", "N s", tile) for tile in tiles] == [
+    assert [re.sub(r"[\d.]+ s ago", "N s ago", tile) for tile in tiles] == [
+        "service.measure2 timed_out, median over 5 s, some over 5 s",
         "state.modeMODE_AUTOset N s ago by basestation",
         "state.selected0never set",
         "state.driver'the operator on the second floor'never set",
