@@ -38,8 +38,8 @@ def completes(action: argparse.Action, words: Words) -> None:
 
 
 def routed(args: argparse.Namespace, _: str = "") -> Iterator[str]:
-    """Yield the payload cases that the table routes, and its gateways."""
-    yield from _names(args, "routes", "gateways")
+    """Yield the payload cases that the table routes, its services, and its gateways."""
+    yield from _names(args, "routes", "services", "gateways")
 
 
 def cases(args: argparse.Namespace, _: str = "") -> Iterable[str]:

@@ -21,12 +21,13 @@ if TYPE_CHECKING:
     from router.compiler.checked import CheckedRoute
 
 _DESCRIPTION = """Show where a route's messages come from and where they go, what each target checks and in which
-order, the whole mapping with the types on both sides, and the largest sizes. --code adds the operations that the router
-executes, with their places in the table; --given shows what each target gets from one payload. For a gateway, show what
-it sends and how often, and what clients may publish; lines with ~ are the topics that its patterns match, among those
-in the table or, with --live, among all topics in the ROS network. Without a name, also show which compiled programs of
-this table 'router run' has kept for its next start, and whether a start with the current variables uses them. --diff
-shows only what two tables do differently."""
+order, the whole mapping with the types on both sides, and the largest sizes. For a service, show what answers it, how
+long the router waits, and its request and reply. --code adds the operations that the router executes, with their
+places in the table; --given shows what each target gets from one payload. For a gateway, show what it sends and how
+often, and what clients may publish; lines with ~ are the topics that its patterns match, among those in the table or,
+with --live, among all topics in the ROS network. Without a name, also show which compiled programs of this table
+'router run' has kept for its next start, and whether a start with the current variables uses them. --diff shows only
+what two tables do differently."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -40,7 +41,7 @@ _LIVE = 2.0
 
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "explain", _DESCRIPTION, *_EXAMPLES)
-    everything = "payload cases, states as state.NAME, and gateways (default: all in the table)"
+    everything = "payload cases, states as state.NAME, services, and gateways (default: all in the table)"
     completes(parser.add_argument("names", nargs="*", metavar="NAME", help=everything), routed)
     add_table(parser)
     parser.add_argument(
@@ -66,12 +67,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _explain(args: argparse.Namespace) -> int:
     from router.tools.explain import (
+        explained_called,
         explained_gateway,
         explained_route,
+        explained_service,
         explained_state,
         ignored_gateway,
         known_topics,
         live_route,
+        routes_of,
         seen_topics,
         tried_route,
     )
@@ -85,10 +89,12 @@ def _explain(args: argparse.Namespace) -> int:
     gateways = {gateway.settings.name: gateway for gateway in checked.gateways}
     ignored = program.table.ignored_gateways
     states = {state.label: state for state in checked.states.values()}
-    known = [*states, *routes, *gateways, *ignored]
+    services = {service.declared.name: explained_service(service) for service in checked.services}
+    services |= {called.declared.name: explained_called(called, program.table) for called in checked.called}
+    known = [*states, *services, *routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
-            raise UsageError(f"{path} has no route, state or gateway '{name}'", did_you_mean(name, known))
+            raise UsageError(f"{path} has no route, state, service or gateway '{name}'", did_you_mean(name, known))
     if args.given is not None and (len(args.names) != 1 or args.names[0] not in routes):
         raise UsageError("--given takes the fields of one payload case", "name it: router explain CASE --given x=1")
     topics, mistyped = seen_topics(program, args.seconds or _LIVE) if args.live else (known_topics(program.table), ())
@@ -96,7 +102,10 @@ def _explain(args: argparse.Namespace) -> int:
     others |= {name: explained_gateway(gateway, topics) for name, gateway in gateways.items()}
     others |= {name: ignored_gateway(gateway) for name, gateway in ignored.items()}
     for name in args.names or known:
-        for route in routes.get(name, ()):
+        if name in services:
+            _print(*services[name], "")
+        of_service = routes_of(name, checked.routes) if name in services and args.names else ()
+        for route in [*of_service, *routes.get(name, ())]:
             code = listed_route(route, program) if args.code else ()
             given = () if args.given is None else tried_route(route, checked, program, args.given)
             now = live_route(route.route, mistyped)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from router.compiler import Checked
 from router.compiler.cdr import message_size
-from router.compiler.checked import CheckedRoute, CheckedState, Target
-from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan, is_service
+from router.compiler.checked import CheckedCalled, CheckedRoute, CheckedService, CheckedState, Target
+from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPlan, is_service, service_label
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
@@ -179,6 +179,39 @@ def explained_state(state: CheckedState, everything: Checked) -> Iterator[str]:
     yield f"  {declared.value.text}, {_validity(declared)}"
     readers = [route.route.name for route in everything.routes if declared.name in states_read(route)]
     yield f"  read by {', '.join(readers) or 'no condition'}"
+
+
+def explained_service(checked: CheckedService) -> Iterator[str]:
+    """Yield lines about a service that an endpoint answers. Its request and reply are among the routes."""
+    declared = checked.declared
+    request, reply = declared.request, declared.reply
+    sender = (reply.sender or request.to).value
+    yield f"service {declared.name}: {declared.type.value}, {checked.ros_name} in ROS  ({declared.span})"
+    yield f"  a call sends {request.case.value} to {request.to.value}"
+    which = "one at a time" if reply.match is None else f"the call with the same {reply.match.text}"
+    yield f"  {reply.case.value} from {sender} answers {which}"
+    again = f" after each of up to {declared.retries + 1} requests" if declared.retries else ""
+    yield f"  waits {duration(declared.timeout.value)} for it{again}"
+    yield f"  responds without it: {declared.on_timeout}"
+
+
+def explained_called(checked: CheckedCalled, table: RouteTable) -> Iterator[str]:
+    """Yield lines about a service that an endpoint calls, likewise."""
+    declared = checked.declared
+    source, call = declared.source, declared.call
+    name = resolved(call.service.value, table.node)
+    yield f"service {declared.name}: {call.type.value}, {name} in ROS  ({declared.span})"
+    yield f"  {source.case.value} from {source.source.value} calls it"
+    yield f"  the response is sent as {declared.reply.case.value} to {source.source.value}"
+    yield f"  waits {duration(call.timeout.value)} for it"
+
+
+def routes_of(service: str, routes: Iterable[CheckedRoute]) -> Iterator[CheckedRoute]:
+    """Yield the routes of the requests and the replies of a service."""
+    label = service_label(service)
+    for route in routes:
+        if route.route.name == label or label in [served.label for served in route.targets]:
+            yield route
 
 
 def _source(name: str, table: RouteTable) -> str:
@@ -549,6 +582,10 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
         parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
     for state in checked.states.values():
         parts[state.label] = _comparable(explained_state(state, checked))
+    for service in checked.services:
+        parts[service_label(service.declared.name)] = _comparable(explained_service(service))
+    for called in checked.called:
+        parts[service_label(called.declared.name)] = _comparable(explained_called(called, table))
     for gateway in checked.gateways:
         parts[f"gateway {gateway.settings.name}"] = [
             *_comparable(explained_gateway(gateway, {})),

@@ -107,6 +107,7 @@ def test_services_of_the_table_and_their_fields(tmp_path: Path) -> None:
 """
     (tmp_path / "table.yaml").write_text(BROKEN.replace("PROTOS", shlex.quote(str(PROTOS))) + services)
     assert completed("router call -t table.yaml h", tmp_path) == ["home"]
+    assert completed("router explain -t table.yaml h", tmp_path) == ["home"]
     assert completed("router call -t table.yaml home data=", tmp_path) == ["false", "true"]
 
 
