@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from router.carrier.conditions import NativeCondition
 from router.clock import wall_ns
+from router.compiler.compiled_table import is_service
 from router.compiler.expressions import ExpressionError, Scope, check
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.expressions.tree import ENVELOPE, Node
@@ -181,6 +182,8 @@ class ShownAction:
         if it.what == RETURNED:
             return f"{it.target} was silent for {it.detail} and is back"
         source = f" from topic {it.topic}" if it.topic else ""
+        if is_service(it.topic):
+            source = f" from {it.topic}" if it.topic != it.route else ""
         if it.what == LOST:
             return f"not sent to {it.target} ({it.route}{source}): {self._why_not()}"
         by = deadman if it.what == BRAKED else f"{it.route}{source}"

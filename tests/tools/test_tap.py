@@ -83,6 +83,19 @@ def test_fields_beside_the_payload_are_shown_as_they_are_sent(
     assert json.loads(sent.json(with_hex=False)).get("envelope") == beside
 
 
+@pytest.mark.parametrize(
+    ("route", "topic", "by"),
+    [
+        ("service.arm", "service.arm", "service.arm"),
+        ("service.home", "service.home.on_timeout", "service.home from service.home.on_timeout"),
+        ("drive", "drive", "drive from topic drive"),
+    ],
+)
+def test_messages_of_services_come_from_no_topic(wire: Wire, route: str, topic: str, by: str) -> None:
+    [sent] = shown(Action(2, SENT, route, "board", topic, data=datagram(wire, "i32=5")), wire)
+    assert sent.line(with_hex=False).split(" ", 1)[1] == f"sent to board ({by}): every_kind i32=5"
+
+
 def test_several_payload_cases_are_sent_in_one_datagram() -> None:
     wire = wire_of("vision.yaml")
     data = envelope_of(wire, ["geometry", "length=9", "envelope.camera=2", "detection", "frame=5"])
