@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +58,8 @@ _PLACES = """places:
                         ?config=FILE of Zenoh, for example for TLS
   envelope://[HOST:]PORT    envelopes, as boards and basestation get them
   envelope://NAME       the same at the address of an endpoint or listener; for
-                        the board of a serial line, at a pty in its place
+                        the board of a serial line, at a pty in its place;
+                        over TCP, it connects or accepts as the named one does
   topic://NAME          a ROS topic"""
 _EXAMPLES = (
     "router listen udp://8502 --ask 127.0.0.1:8500",
@@ -143,8 +144,8 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     from router.tools.tap import listen
 
     wire, table = load_wire(args, place)
-    if table is not None and (line := links.line_of(place, table)) is not None:
-        _listen_to_line(line, table, wire, args, is_board=place != line.name)
+    if table is not None and (link := links.link_of(place, table)) is not None:
+        _listen_to_link(link, table, wire, args, place)
         return
     address = udp.listening(place, table)
     envelope = wire.envelopes.first if table is None else udp.received_at(address, table, wire.envelopes)
@@ -155,15 +156,19 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
             print_batches(listen(receiver, wire, envelope, udp.peer_names(table)), args)
 
 
-def _listen_to_line(line: Listener, table: RouteTable, wire: Wire, args: argparse.Namespace, *, is_board: bool) -> None:
+def _listen_to_link(link: Listener, table: RouteTable, wire: Wire, args: argparse.Namespace, place: str) -> None:
     from router.tools import links
 
-    with closing(links.end_of(line, is_board=is_board)) as end:
-        what = f"at {end.device}, a pty that the router can open" if is_board else f"to {end.device}"
-        say(f"listening {what}; press Ctrl-C to stop")
-        peer = line.name if is_board else links.board_at(line, table)
+    boards = links.boards_at(link, table)
+    is_board = place != link.name
+    with ExitStack() as opened:
+        ends = [links.board_end(link, table.endpoints[place])] if is_board else links.router_ends(link, boards)
+        for end in ends:
+            opened.enter_context(closing(end))
+        say(f"listening {ends[0].where}; press Ctrl-C to stop")
+        peers = [link.name] if is_board else [board.name for board in boards]
         with until_interrupted():
-            print_batches(links.listen(end, peer, wire, wire.envelopes.at(line.name)), args)
+            print_batches(links.listen([*zip(ends, peers, strict=True)], wire, wire.envelopes.at(link.name)), args)
 
 
 def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:

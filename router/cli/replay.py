@@ -33,9 +33,9 @@ DIFFERENT = 1
 
 _DESCRIPTION = """\
 Send the datagrams of a recording again, at the recorded intervals, to the listeners of the table and from the
-addresses that the table has for their senders. For a serial line, be its other end, at a pty that the router can open.
-With --against, send nothing: run them through the table and another one, and print what they would deliver
-differently; exit code 1 if there is a difference.
+addresses that the table has for their senders. For a serial line, be its other end, at a pty that the router can open;
+over TCP, be the boards. With --against, send nothing: run them through the table and another one, and print what they
+would deliver differently; exit code 1 if there is a difference.
 """
 
 _EXAMPLES = (
@@ -85,10 +85,10 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
     origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
     with until_interrupted(), closing(replayer), _progress(recording, "sending") as update:
-        for pty in replayer.ptys.values():
-            if not pty.is_open:
-                say(f"waiting for the router to open {pty.device}; press Ctrl-C to stop")
-            pty.await_opened()
+        for end in replayer.ends:
+            if not end.is_open:
+                say(f"waiting for {end.awaited}; press Ctrl-C to stop")
+            end.await_open()
         for datagram in on_time(recording, args.speed or 1.0):
             replayer.send(datagram)
             update(completed=recording.position)

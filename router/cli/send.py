@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from router.datagrams import Wire
     from router.table.addresses import Address
     from router.table.model import RouteTable
-    from router.table.model.endpoints import Listener
+    from router.table.model.endpoints import Endpoint, Listener
+    from router.tools.link_end import LinkEnd
     from router.tools.udp import Sent
     from router.types.table_envelopes import Envelopes
 
@@ -32,8 +33,9 @@ _EXAMPLES = (
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    description = """Build a payload from field=value words and send it in an envelope. To the listener of a serial
-line, send it as the board: at a pty, when the router has opened it; to the board, at the line's device."""
+    description = """Build a payload from field=value words and send it in an envelope. To the listener of a serial line
+or TCP connection, send it as the board, once the router is there: at a pty, or over TCP. To the board, send it as the
+router: at the line's device, or over TCP."""
     parser = add_verb(subparsers, "send", description, *_EXAMPLES)
     completes(parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info"), cases)
     completes(
@@ -71,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     count = args.count if args.count is not None else None if args.rate else 1
     if table is not None:
         _require_case(wire.envelopes, table, args)
-    if table is not None and (line := links.line_of(args.to, table)) is not None:
-        return _send_frames(args, line, table, data, count)
+    if table is not None and (link := links.link_of(args.to, table)) is not None:
+        return _send_frames(args, link, table, data, count)
     to = udp.destination(args.to, table)
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
     sent = Sent()
@@ -95,21 +97,33 @@ def _require_case(envelopes: Envelopes, table: RouteTable, args: argparse.Namesp
         raise UsageError(f"'{args.to}' takes {around.name}, which has no payload case '{args.case}'", hint)
 
 
-def _send_frames(args: argparse.Namespace, line: Listener, table: RouteTable, data: bytes, count: int | None) -> int:
-    """Send to the router as the board at the other end of a line, or to the board as the router."""
+def _send_frames(args: argparse.Namespace, link: Listener, table: RouteTable, data: bytes, count: int | None) -> int:
+    """Send to the router as the board at the other end of a link, or to the board as the router."""
     from router.tools import links
     from router.tools.udp import Sent
 
-    board = links.board_at(line, table)
-    if args.origin and args.origin != board:
-        raise UsageError(f"what is sent to '{args.to}' is not from {args.origin}", "leave out --from")
     sent = Sent()
-    with closing(links.end_of(line, is_board=args.to != board)) as end, until_interrupted():
-        if args.to != board:
-            say(f"waiting for the router to open {end.device}; press Ctrl-C to stop")
+    with closing(_end(args, link, links.boards_at(link, table))) as end, until_interrupted():
+        if end.awaited:
+            say(f"waiting for {end.awaited}; press Ctrl-C to stop")
         links.send(end, data, count, args.rate, sent)
     print(_summary(_cases(args), data, args.to, sent))
     return 0
+
+
+def _end(args: argparse.Namespace, link: Listener, boards: Sequence[Endpoint]) -> LinkEnd:
+    """Open the end of a link that sends to --to. Raises UsageError."""
+    from router.tools import links
+
+    named = {board.name: board for board in boards}
+    senders = {} if args.to in named else named
+    if args.origin and args.origin not in senders:
+        raise UsageError(f"what is sent to '{args.to}' is not from {args.origin}", "leave out --from")
+    if args.to in named:
+        return links.router_ends(link, [named[args.to]])[0]
+    if len(boards) > 1 and not args.origin:
+        raise UsageError(f"several boards connect to '{args.to}'", f"add --from {boards[0].name}")
+    return links.board_end(link, senders[args.origin or boards[0].name])
 
 
 def _cases(args: argparse.Namespace) -> str:

@@ -28,8 +28,8 @@ CHANGES_SHOWN = 3
 _DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Lists have
 as many elements as the table's mappings need. Boards obey commands, halt when a deadman stops them, and stop after a
 second without commands. Endpoints reply to the requests of services. The endpoints' addresses must belong to this
-computer, as in routes/sim.yaml. A board on a serial line is at a pty, at the path of the device: nothing may be
-there."""
+computer, as in routes/sim.yaml. A board on a serial line is at a pty, at the path of the device: nothing may be there.
+Over TCP, boards accept the router or connect to it."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",

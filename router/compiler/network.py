@@ -336,11 +336,11 @@ def sent_by(endpoint: Endpoint) -> tuple[str, int]:
 def arrival(table: RouteTable, listener: str, peer: tuple[str, int], sender: str) -> tuple[str, tuple[str, int]] | None:
     """Return listener and address at which a table receives what another one has received so from an endpoint.
 
-    They differ if only one of the tables has `sender` at a serial line. None: this table does not receive it.
+    They differ if only one of the tables has `sender` at a link. None: this table does not receive it.
     """
     endpoint, place = table.endpoints.get(sender), table.listeners.get(listener)
-    if endpoint is not None and isinstance(endpoint.address.value, SerialPlace) and endpoint.listener is not None:
-        return endpoint.listener.value, ON_LINE
+    if endpoint is not None and _is_on_link(endpoint) and endpoint.listener is not None:
+        return endpoint.listener.value, sent_by(endpoint)
     if place is not None and (place.line is not None) == (peer == ON_LINE):
         return listener, peer
     if endpoint is None or not endpoint.address.value.is_known or peer != ON_LINE or not table.sockets:

@@ -1,4 +1,4 @@
-"""The two ends of serial lines, for tools: the device, and a pty in its place, at which the other end is played."""
+"""The ends of links, serial lines and TCP connections, for tools: the router's, and the one that a board has."""
 
 from __future__ import annotations
 
@@ -9,85 +9,32 @@ import select
 import termios
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router import declared as c
-from router.carrier.frames import Codec, Frame
 from router.clock import wall_ns
 from router.errors import TransportError, UsageError
-from router.image.openings import framing_of
 from router.library import library
 from router.net.links import device_holder, why_closed
+from router.table.addresses import LinkPlace
+from router.table.model.tcp import TcpClient, TcpServer
+from router.tools.link_end import OPENED_WITHIN, READ_WITHIN, LinkEnd
 from router.tools.tap import PATIENCE, TappedDatagram, local_time, tapped_datagram
-from router.tools.udp import Sent, paced
+from router.tools.tcp_ends import Accepting, Connecting, Server
+from router.tools.udp import Sent, paced, reachable
 
 if TYPE_CHECKING:
+    from router.carrier.frames import Frame
     from router.datagrams import Wire
     from router.table.model import RouteTable
-    from router.table.model.endpoints import Listener
+    from router.table.model.endpoints import Endpoint, Listener
     from router.types.protobuf import Envelope
 
-READ_AT_ONCE = 65536
 
-OPENED_WITHIN = 0.02
-"""Seconds after which it is noticed that the router has opened a line."""
-
-READ_WITHIN = 0.2
-"""Seconds in which the router reads what was sent. Closing a pty discards the rest."""
-
-
-class LineEnd:
-    """One end of a serial line. It never blocks. `name` is for people."""
-
-    def __init__(self, line: Listener, fd: int) -> None:
-        assert line.line is not None  # noqa: S101 - checked by the caller
-        self.name = line.name
-        self.device = Path(line.line.serial.value)
-        self._fd = fd
-        self._codec = Codec(framing_of(line.line))
-        self._rest = b""
-
-    def fileno(self) -> int:
-        return self._fd
-
-    def send(self, payload: bytes) -> None:
-        """Send a frame. Raises BlockingIOError if an earlier one is still waiting, OSError if it cannot be sent."""
-        self._flush()
-        if self._rest:
-            raise BlockingIOError(errno.EAGAIN, "the line is full")
-        self._rest = self._codec.write(payload)
-        if not self._rest:
-            raise OSError(errno.EMSGSIZE, os.strerror(errno.EMSGSIZE))
-        self._flush()
-
-    def finish(self) -> None:
-        """Wait until what was sent has left. Raises OSError."""
-        while self._rest:
-            select.select([], [self._fd], [], PATIENCE)
-            self._flush()
-
-    def _flush(self) -> None:
-        with suppress(BlockingIOError):
-            self._rest = self._rest[os.write(self._fd, self._rest) :]
-
-    def receive(self) -> list[Frame]:
-        """Return the frames that are complete with the bytes that have arrived. Raises OSError at the stream's end."""
-        try:
-            data = os.read(self._fd, READ_AT_ONCE)
-        except BlockingIOError:
-            return []
-        if not data:
-            raise OSError(errno.EIO, os.strerror(errno.ENOTCONN))
-        return [*self._codec.read(data)]
-
-    def close(self) -> None:
-        os.close(self._fd)
-
-
-class Device(LineEnd):
+class Device(LinkEnd):
     """The device of a line, opened as the router does. Raises UsageError if that fails."""
 
     def __init__(self, line: Listener) -> None:
@@ -97,7 +44,11 @@ class Device(LineEnd):
         fd = library().serial_open(serial.serial.value.encode(), ctypes.byref(settings))
         if fd < 0:
             raise _not_opened(line, -fd)
-        super().__init__(line, fd)
+        super().__init__(line, fd, serial.serial.value)
+
+    @property
+    def where(self) -> str:
+        return f"to {self.place}"
 
     def close(self) -> None:
         with suppress(termios.error):  # it was unplugged
@@ -113,20 +64,23 @@ def _not_opened(line: Listener, error: int) -> UsageError:
     return UsageError(f"'{line.name}': cannot open {device}: {why}", remedy.replace("DEVICE", device))
 
 
-class Pty(LineEnd):
+class Pty(LinkEnd):
     """The other end of a line: a pty, with a link to it at the path of the line's device.
 
     Raises UsageError if the path is taken, or the link cannot be made.
     """
 
+    opens_again = True
+
     def __init__(self, line: Listener) -> None:
+        self.device = Path(line.address.value.host)
         fd, device = os.openpty()
         tty.setraw(device)  # before anybody opens it: it would echo
         self._pty = os.ttyname(device)
         self._sent_at = 0.0
         os.close(device)
         os.set_blocking(fd, False)
-        super().__init__(line, fd)
+        super().__init__(line, fd, str(self.device))
         try:
             if self.device.is_symlink() and not self.device.exists():  # left by a simulator that was killed
                 self.device.unlink()
@@ -142,9 +96,16 @@ class Pty(LineEnd):
         poll.register(self._fd, 0)
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
 
-    def await_opened(self) -> None:
-        while not self.is_open:
-            time.sleep(OPENED_WITHIN)
+    @property
+    def awaited(self) -> str:
+        return f"the router to open {self.place}"
+
+    @property
+    def where(self) -> str:
+        return f"at {self.place}, a pty that the router can open"
+
+    def __str__(self) -> str:
+        return f"the pty {self.place}"
 
     def send(self, payload: bytes) -> None:
         """Likewise, but also raises OSError while nobody has opened the device."""
@@ -161,9 +122,10 @@ class Pty(LineEnd):
             self._begin()
             raise
 
-    def _begin(self) -> None:
-        self._codec.begin()
-        self._rest = b""
+    def ended(self, error: OSError) -> TransportError:
+        if error.errno == errno.EMSGSIZE:
+            return super().ended(error)
+        return TransportError(f"the router has closed {self.place}", "its log says why")
 
     def close(self) -> None:
         """Close the pty after the router has had time to read it."""
@@ -183,60 +145,84 @@ def _no_pty(line: Listener, error: OSError) -> UsageError:
     return UsageError(f"cannot make {device}, to play the other end of '{line.name}': {error.strerror}", other)
 
 
-def line_of(name: str, table: RouteTable | None) -> Listener | None:
-    """Return the line that is a listener of this name, or that has the endpoint of this name at its other end."""
+def link_of(name: str, table: RouteTable | None) -> Listener | None:
+    """Return the link that is a listener of this name, or that has the endpoint of this name at its other end."""
     if table is None:
         return None
     endpoint = table.endpoints.get(name)
     listener = endpoint.listener.value if endpoint is not None and endpoint.listener is not None else name
-    return next((line for line in table.lines if line.name == listener), None)
+    return next((link for link in table.links if link.name == listener), None)
 
 
-def end_of(line: Listener, *, is_board: bool) -> LineEnd:
-    """Open the end of a line that the board has, or the router's. Raises UsageError."""
-    return Pty(line) if is_board else Device(line)
+def boards_at(link: Listener, table: RouteTable) -> list[Endpoint]:
+    """Return the endpoints at the other end of a link: several only of a TCP server. Raises UsageError for none."""
+    ends = (each for each in table.endpoints.values() if isinstance(each.address.value, LinkPlace))
+    boards = [each for each in ends if each.listener is not None and each.listener.value == link.name]
+    if not boards:
+        raise UsageError(f"no endpoint of the table is at the other end of '{link.name}'", "add one")
+    return boards
 
 
-def board_at(line: Listener, table: RouteTable) -> str:
-    """Return the endpoint at the other end of a line, or the line's own name if the table lacks one."""
-    ends = {each.listener.value: each.name for each in table.endpoints.values() if each.listener is not None}
-    return ends.get(line.name, line.name)
+def board_end(link: Listener, board: Endpoint) -> LinkEnd:
+    """Open the end of a link that a board has. Raises UsageError."""
+    if isinstance(link.link, TcpClient):
+        return Accepting(link, Server(link.name, link.link.connect.value), "the router")
+    if isinstance(link.link, TcpServer):
+        return Connecting(link, reachable(link.link.accept.value), board.address.value.host, is_patient=True)
+    return Pty(link)
 
 
-def send(end: LineEnd, data: bytes, count: int | None, rate: float | None, sent: Sent) -> None:
-    """Send frames like `udp.send`. At a pty, first wait until the router has opened it. Raises TransportError."""
-    if isinstance(end, Pty):
-        end.await_opened()
+def router_ends(link: Listener, boards: Sequence[Endpoint]) -> list[LinkEnd]:
+    """Open the router's end of a link to each of these boards. Raises UsageError."""
+    if isinstance(link.link, TcpClient):
+        return [Connecting(link, link.link.connect.value)]
+    if isinstance(link.link, TcpServer):
+        server = Server(link.name, link.link.accept.value, [board.address.value.host for board in boards])
+        return [Accepting(link, server, board.name, board.address.value.host) for board in boards]
+    return [Device(link)]
+
+
+def send(end: LinkEnd, data: bytes, count: int | None, rate: float | None, sent: Sent) -> None:
+    """Send frames like `udp.send`, once the end is open. Raises TransportError."""
+    end.await_open()
     for elapsed in paced(count, rate):
         send_once(end, data)
         sent.count += 1
         sent.seconds = elapsed
 
 
-def send_once(end: LineEnd, data: bytes) -> None:
+def send_once(end: LinkEnd, data: bytes) -> None:
     """Send a frame, and wait until it has left. Raises TransportError."""
     try:
         end.send(data)
         end.finish()
     except OSError as error:
-        raise _ended(end, error) from error
+        raise end.ended(error) from error
 
 
-def listen(end: LineEnd, peer: str, wire: Wire, envelope: Envelope) -> Iterator[list[TappedDatagram]]:
-    """Yield what frames hold, without end; after PATIENCE without one, an empty list. Raises TransportError."""
+def listen(ends: Sequence[tuple[LinkEnd, str]], wire: Wire, envelope: Envelope) -> Iterator[list[TappedDatagram]]:
+    """Yield what frames hold, without end; after PATIENCE without one, an empty list. Raises TransportError.
+
+    `ends`: each with the name of who is at its other end.
+    """
+    peers = dict(ends)
     while True:
-        if isinstance(end, Pty) and not end.is_open:
+        opened = [end for end in peers if end.is_open]
+        if not opened:
             time.sleep(OPENED_WITHIN)
             yield []
             continue
-        select.select([end], [], [], PATIENCE)
-        try:
-            frames = end.receive()
-        except OSError as error:
-            if not isinstance(end, Pty):
-                raise _ended(end, error) from error
-            frames = []
-        yield [shown for frame in frames for shown in _shown(frame, peer, wire, envelope)]
+        ready, _, _ = select.select(opened, [], [], PATIENCE)
+        yield [shown for end in ready for frame in _arrived(end) for shown in _shown(frame, peers[end], wire, envelope)]
+
+
+def _arrived(end: LinkEnd) -> list[Frame]:
+    try:
+        return end.receive()
+    except OSError as error:
+        if not end.opens_again:
+            raise end.ended(error) from error
+        return []
 
 
 def _shown(frame: Frame, peer: str, wire: Wire, envelope: Envelope) -> list[TappedDatagram]:
@@ -244,12 +230,3 @@ def _shown(frame: Frame, peer: str, wire: Wire, envelope: Envelope) -> list[Tapp
     if frame.problem:
         return [TappedDatagram(local_time(at), peer, frame.data, None, frame.problem)]
     return tapped_datagram(at, peer, frame.data, wire, envelope=envelope)
-
-
-def _ended(end: LineEnd, error: OSError) -> TransportError:
-    if error.errno == errno.EMSGSIZE:
-        return TransportError(f"'{end.name}': its framing has no length for so many bytes")
-    if isinstance(end, Pty):
-        return TransportError(f"the router has closed {end.device}", "its log says why")
-    why, remedy = why_closed(error.errno or 0)
-    return TransportError(f"'{end.name}' is closed: {why}", remedy)

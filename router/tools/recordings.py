@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns, time_ns
@@ -21,8 +21,9 @@ from router.recording.recorder import PERIOD
 from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
+from router.table.model.endpoints import Endpoint, Listener
 from router.tools import links, udp
-from router.tools.links import Pty
+from router.tools.link_end import LinkEnd
 from router.types.table_envelopes import Envelopes
 
 MOST_SOCKETS = 256
@@ -124,8 +125,8 @@ class Replayer:
     """Sends to `to`, or to the listener's address in `table`; from `origin`, or from the sender's address.
 
     The sender's address is that of the endpoint in `table`, else the recorded one. If this computer does not have it,
-    any address is used, and `resent` names the sender. At each serial line of `table`, it is the other end, unless
-    there is `to`.
+    any address is used, and `resent` names the sender. At each link of `table`, it is the boards, unless there is
+    `to`.
     """
 
     def __init__(self, table: RouteTable | None, to: Address | None, origin: Address | None) -> None:
@@ -134,22 +135,23 @@ class Replayer:
         self._to = to
         self._origin = origin
         self._sockets: dict[tuple[str, tuple[str, int], str], socket.socket] = {}
-        self.ptys: dict[str, Pty] = {}
-        self._taken: dict[str, UsageError] = {}
-        """Why there is no pty for a line. The recording may have nothing from it."""
-        for line in table.lines if table is not None and to is None else ():
-            try:
-                self.ptys[line.name] = Pty(line)
-            except UsageError as error:
-                self._taken[line.name] = error
+        self._ends: dict[str, dict[str, LinkEnd | UsageError]] = {}
+        """The ends of boards by listener and endpoint, or why there is none: the recording may have nothing from it."""
+        if table is not None and to is None:
+            self._ends = {
+                link.name: {board.name: _board_end(link, board) for board in links.boards_at(link, table)}
+                for link in table.links
+            }
+
+    @property
+    def ends(self) -> list[LinkEnd]:
+        return [end for ends in self._ends.values() for end in ends.values() if isinstance(end, LinkEnd)]
 
     def send(self, datagram: Recorded) -> None:
         """Send a datagram or frame. Raises UsageError if its listener is nowhere, TransportError if sending fails."""
         datagram = self._moved(datagram)
-        if (taken := self._taken.get(datagram.listener)) is not None:
-            raise taken
-        if (pty := self.ptys.get(datagram.listener)) is not None:
-            links.send_once(pty, datagram.data)
+        if (ends := self._ends.get(datagram.listener)) is not None:
+            links.send_once(_end_of(ends, datagram), datagram.data)
             self.resent.datagrams += 1
             return
         key = (datagram.listener, datagram.peer, datagram.endpoint)
@@ -165,7 +167,7 @@ class Replayer:
         self.resent.datagrams += 1
 
     def _moved(self, datagram: Recorded) -> Recorded:
-        """Return a datagram with the listener at which the table has its sender, if that is at a serial line or was."""
+        """Return a datagram with the listener at which the table has its sender, if that is at a link or was."""
         if self._table is None or self._to is not None:
             return datagram
         place = arrival(self._table, datagram.listener, datagram.peer, datagram.endpoint)
@@ -173,8 +175,8 @@ class Replayer:
 
     def close(self) -> None:
         self._close_sockets()
-        for pty in self.ptys.values():
-            pty.close()
+        for end in self.ends:
+            end.close()
 
     def _close_sockets(self) -> None:
         for sender in self._sockets.values():
@@ -214,3 +216,21 @@ class Replayer:
                 continue
         self.resent.elsewhere[datagram.endpoint or f"{datagram.peer[0]}:{datagram.peer[1]}"] = wanted.host
         return udp.open_udp(udp.ANYWHERE, "replay")
+
+
+def _board_end(link: Listener, board: Endpoint) -> LinkEnd | UsageError:
+    try:
+        return links.board_end(link, board)
+    except UsageError as error:
+        return error
+
+
+def _end_of(ends: Mapping[str, LinkEnd | UsageError], datagram: Recorded) -> LinkEnd:
+    """Return the end of the board that has sent a frame, or the only one at the link. Raises UsageError."""
+    end = ends.get(datagram.endpoint) or (next(iter(ends.values())) if len(ends) == 1 else None)
+    if end is None:
+        what = f"the table has no endpoint '{datagram.endpoint}' at '{datagram.listener}'"
+        raise UsageError(what, did_you_mean(datagram.endpoint, ends) or "name the table of the recording with -t")
+    if isinstance(end, UsageError):
+        raise end
+    return end

@@ -1,7 +1,8 @@
-"""All boards and the basestation of a route table on one machine, over real UDP and serial lines.
+"""All boards and the basestation of a route table on one machine, over real UDP, serial lines and TCP.
 
 Each endpoint binds its own address, sends the payload cases that have it as their source, receives, and replies to the
-requests of services. At the other end of a serial line, it is a pty in the place of the line's device.
+requests of services. At the other end of a serial line, it is a pty in the place of the line's device; over TCP, it
+accepts the router or connects to it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import socket
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,13 +25,14 @@ from router.compiler.expressions.tree import ENVELOPE, MESSAGE
 from router.compiler.resolution import stand_in
 from router.datagrams import Decoded, Wire
 from router.errors import UsageError, did_you_mean, listed
-from router.table.addresses import Address, SerialPlace
+from router.table.addresses import Address, LinkPlace
 from router.table.model import RouteTable
-from router.table.model.endpoints import Endpoint
+from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.routes import ANY
 from router.table.units import LARGEST_DATAGRAM
+from router.tools import links
 from router.tools.board import Change, Inbox, boards
-from router.tools.links import Pty
+from router.tools.link_end import LinkEnd
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
 from router.tools.sim_replies import Reply, replies
 from router.tools.udp import LOOPBACK, listener_address, located, open_udp
@@ -180,7 +183,7 @@ class Statistics:
 
     `is_answered`: whether a route forwards or answers what endpoints send (what comes from ROS may not be published
     yet).
-    `unsent` are datagrams that the kernel refused to take, and frames for a pty that is full or not open.
+    `unsent` are datagrams that the kernel refused to take, and frames for a link that is full or not open.
     `changes` are those of the boards, the newest last.
     """
 
@@ -191,13 +194,28 @@ class Statistics:
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=MOST_CHANGES))
 
 
+@contextmanager
+def _of_this_computer() -> Iterator[None]:
+    """Say what to do about an address that is not one of this computer."""
+    try:
+        yield
+    except UsageError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
+            raise UsageError(
+                str(error),
+                "simulate a table with addresses of this computer, for example 127.0.0.2; "
+                "routes/sim.yaml has such addresses for the rover's endpoints",
+            ) from error
+        raise
+
+
 class Simulator:
     """Simulates the endpoints of a table, and binds the addresses of all at once.
 
-    Raises UsageError if one cannot be bound or opened, and for a table without listeners, or with TCP connections.
-    `deadmen` and `services` are those of the compiled program: boards halt on what deadmen send, and endpoints reply to
-    the requests of services. Boards in `obeys` obey these payload cases only. `lengths` are those of lists that
-    mappings need (`lengths.needed_lengths`).
+    Raises UsageError if one cannot be bound or opened, and for a table without listeners. `deadmen` and `services` are
+    those of the compiled program: boards halt on what deadmen send, and endpoints reply to the requests of services.
+    Boards in `obeys` obey these payload cases only. `lengths` are those of lists that mappings need
+    (`lengths.needed_lengths`).
     """
 
     def __init__(
@@ -215,11 +233,6 @@ class Simulator:
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nothing receives what boards would send")
-        if len(table.links) > len(table.lines):
-            raise UsageError(
-                f"{table.path} has TCP connections, which are not simulated",
-                "simulate a table that gives their boards an 'address' and no 'listener'",
-            )
         self.statistics = Statistics(
             is_answered=any(route.sources and (route.destinations or route.reply) for route in table.routes)
         )
@@ -237,16 +250,17 @@ class Simulator:
         check_silences(silences, [*self._streams, *(reply for reply, _ in self._replies)])
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed, lengths) for stream in self._streams]
         self._selector = selectors.DefaultSelector()
-        self._opened: list[socket.socket | Pty] = []
-        self._unopened: dict[Pty, Inbox] = {}
-        """The ptys that nobody has opened."""
+        self._opened: list[socket.socket | LinkEnd] = []
+        self._unopened: dict[LinkEnd, Inbox] = {}
+        """The ends of links that the router has not opened."""
+        self._ends: dict[str, LinkEnd] = {}
+        """The first end of each link."""
         self._senders: dict[str, Callable[[bytes, str], None]] = {}
         self._stopping = False
         try:
             self._routers = {listener.name: listener_address(listener) for listener in table.sockets}
-            self._ptys = {line.name: self._kept(Pty(line)) for line in table.lines}
             # Endpoints without a `listener` send to the first one that receives the payload case.
-            names, envelopes = (*self._routers, *self._ptys), wire.envelopes
+            names, envelopes = (*self._routers, *(link.name for link in table.links)), wire.envelopes
             self._first = {
                 case: next((name for name in names if envelopes.at(name) is envelopes.of(case)), names[0])
                 for case in envelopes.cases
@@ -265,8 +279,7 @@ class Simulator:
         who = "1 endpoint sends" if endpoints == 1 else f"{endpoints} endpoints send"
         what = "1 payload case" if cases == 1 else f"{cases} payload cases"
         rate = sum(stream.rate for stream in self._streams)
-        first, ptys = [*self._routers.values()][:1], self._ptys.values()
-        to = listed([*map(str, first), *(f"the pty {pty.device}" for pty in ptys)])
+        to = listed([*map(str, [*self._routers.values()][:1]), *map(str, self._ends.values())])
         requests = sorted({reply.request for reply, _ in self._replies})
         answers = f", and replies to {listed(requests)}" if requests else ""
         return f"{who} {what}, {rate:.0f}/s, to {to}{answers}"
@@ -274,14 +287,15 @@ class Simulator:
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`.
 
-        The other end of a serial line has its pty.
+        The other end of a link has that.
         """
         inbox = self.statistics.inboxes[endpoint.name]
         listener = endpoint.listener.value if endpoint.listener is not None else None
-        if isinstance(endpoint.address.value, SerialPlace) and listener is not None:
-            pty = self._ptys[listener]
-            self._unopened[pty] = inbox
-            self._senders[endpoint.name] = lambda data, _: pty.send(data)
+        if isinstance(endpoint.address.value, LinkPlace) and listener is not None:
+            end = self._open_end(self._table.listeners[listener], endpoint)
+            self._ends.setdefault(listener, end)
+            self._unopened[end] = inbox
+            self._senders[endpoint.name] = lambda data, _: end.send(data)
             return
         port = endpoint.source_port.value if endpoint.source_port else 0
         is_learned = endpoint.address.value.is_learned
@@ -297,32 +311,26 @@ class Simulator:
     def _sending(self, sender: socket.socket, listener: str | None) -> Callable[[bytes, str], None]:
         """Return a function that sends the envelope of a payload case from a socket to a listener.
 
-        The default is the first one that receives the case; a serial line only if no other does.
+        The default is the first one that receives the case; a link only if no other does.
         """
 
         def send(data: bytes, case: str) -> None:
-            if (to := listener or self._first[case]) in self._ptys:
-                self._ptys[to].send(data)
+            if (to := listener or self._first[case]) in self._ends:
+                self._ends[to].send(data)
             else:
                 sender.sendto(data, self._routers[to])
 
         return send
 
-    def _kept(self, pty: Pty) -> Pty:
-        self._opened.append(pty)
-        return pty
+    def _open_end(self, link: Listener, endpoint: Endpoint) -> LinkEnd:
+        with _of_this_computer():
+            end = links.board_end(link, endpoint)
+        self._opened.append(end)
+        return end
 
     def _open(self, address: Address, owner: str, endpoint: Endpoint | None = None) -> socket.socket:
-        try:
+        with _of_this_computer():
             opened = open_udp(address, owner, endpoint)
-        except UsageError as error:
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
-                raise UsageError(
-                    str(error),
-                    "simulate a table with addresses of this computer, for example 127.0.0.2; "
-                    "routes/sim.yaml has such addresses for the rover's endpoints",
-                ) from error
-            raise
         self._opened.append(opened)
         return opened
 
@@ -408,14 +416,14 @@ class Simulator:
         return replace(now, speed=now.speed * inbox.board.pace(at))
 
     def _watch_opened(self) -> None:
-        """Receive from the ptys that have been opened; the others would always be ready."""
-        for pty, inbox in [*self._unopened.items()]:
-            if pty.is_open:
-                del self._unopened[pty]
-                self._selector.register(pty, selectors.EVENT_READ, (pty, inbox))
+        """Receive from the links that have been opened; the others would always be ready."""
+        for end, inbox in [*self._unopened.items()]:
+            if end.is_open:
+                del self._unopened[end]
+                self._selector.register(end, selectors.EVENT_READ, (end, inbox))
 
-    def _receive(self, receiver: socket.socket | Pty, inbox: Inbox, now: float, epoch: float) -> None:
-        if isinstance(receiver, Pty):
+    def _receive(self, receiver: socket.socket | LinkEnd, inbox: Inbox, now: float, epoch: float) -> None:
+        if isinstance(receiver, LinkEnd):
             self._receive_frames(receiver, inbox, now, epoch)
             return
         for _ in range(DRAIN):
@@ -425,12 +433,12 @@ class Simulator:
                 return
             self._take(inbox, data, now, epoch)
 
-    def _receive_frames(self, pty: Pty, inbox: Inbox, now: float, epoch: float) -> None:
+    def _receive_frames(self, end: LinkEnd, inbox: Inbox, now: float, epoch: float) -> None:
         try:
-            frames = pty.receive()
+            frames = end.receive()
         except OSError:  # nobody has it open any more
-            self._selector.unregister(pty)
-            self._unopened[pty] = inbox
+            self._selector.unregister(end)
+            self._unopened[end] = inbox
             return
         for frame in frames:
             if frame.problem:

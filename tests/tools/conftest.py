@@ -82,6 +82,24 @@ def line_path(table_path: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
+def tcp_path(table_path: Callable[..., Path]) -> Callable[[str], Path]:
+    """Write the same table with the board, and `other` if it is a server, over TCP: of `connect` or `accept`."""
+
+    def write(way: str) -> Path:
+        path = table_path()
+        tcp = f"127.0.0.1:{free_port('127.0.0.1', socket.SOCK_STREAM)}"
+        link = f'  tcp: {{{way}: "{tcp}", framing: {{length: u16be}}, checksum: crc32}}\n'
+        text = path.read_text().replace("endpoints:\n", f"{link}endpoints:\n", 1)
+        address = "address: 127.0.6.30, " if way == "accept" else ""
+        other = "  other: {address: 127.0.6.31, listener: tcp, kind: board}\n" if way == "accept" else ""
+        text = text.replace("  station:", f"{other}  station:", 1)
+        path.write_text(re.sub("address: 127.0.6.30:[0-9]+", f"{address}listener: tcp", text))
+        return path
+
+    return write
+
+
+@pytest.fixture
 def receiver() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.6.5", 0))
