@@ -192,8 +192,9 @@ def send(end: LinkEnd, data: bytes, count: int | None, rate: float | None, sent:
 
 
 def send_once(end: LinkEnd, data: bytes) -> None:
-    """Send a frame, and wait until it has left. Raises TransportError."""
+    """Discard what has arrived, send a frame, and wait until it has left. Raises TransportError."""
     try:
+        end.receive()  # the router closes a TCP connection that nobody reads
         end.send(data)
         end.finish()
     except OSError as error:

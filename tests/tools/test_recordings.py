@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -19,7 +19,7 @@ from router.observe.tap import Lost
 from router.recording.reader import Recorded, Recording
 from router.table import read_table
 from router.tools import recordings
-from router.tools.links import Device
+from router.tools.links import Device, boards_at, router_ends
 from router.tools.recordings import TapRecording, on_time
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
@@ -235,6 +235,48 @@ def test_frames_are_sent_at_the_other_end_of_a_line(tmp_path: Path, place: tuple
         "sent 3 datagrams\n",
         f"waiting for the router to open {tmp_path}/uart; press Ctrl-C to stop\n",
     )
+
+
+TCP_TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  tcp: {{accept: "127.0.0.1:{port}", framing: {{length: u16le}}}}
+endpoints:
+  sensor_board: {{listener: tcp, address: 127.0.6.30, kind: board}}
+  drill: {{listener: tcp, address: 127.0.6.31, kind: board}}
+routes: {{}}
+"""
+
+
+@pytest.mark.parametrize("listener", ["tcp", "rover"], ids=["of the server", "of another table"])
+def test_frames_are_sent_by_the_boards_of_a_tcp_server(tmp_path: Path, listener: str) -> None:
+    frames = [each._replace(listener=listener, endpoint="sensor_board") for each in seen(imu(1), b"bad", peer=BOARD)]
+    drill = [each._replace(listener="tcp", endpoint="drill") for each in seen(imu(2), peer=("127.0.6.31", 0))]
+    path, table_path = recorded(tmp_path / "it.mcap", [*frames, *drill]), tmp_path / "table.yaml"
+    table_path.write_text(TCP_TABLE.format(protos=PROTOS, port=free_port(kind=socket.SOCK_STREAM)))
+    table = read_table(table_path)
+    (server,) = table.links
+    ends = router_ends(server, boards_at(server, table))
+    command = [sys.executable, "-m", "router", "replay", str(path), "-t", str(table_path), "--speed", "max"]
+    got: list[list[bytes]] = [[], []]
+
+    def arrived() -> bool:
+        for end, frames in zip(ends, got, strict=True):
+            if end.is_open:
+                with suppress(ConnectionResetError):  # at the end
+                    frames += [frame.data for frame in end.receive()]
+        return sum(map(len, got)) == 3
+
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as replay:
+        try:
+            wait_until(arrived)
+            assert replay.communicate(timeout=30)[0] == "sent 3 datagrams\n"
+        finally:
+            for end in ends:
+                end.close()
+            replay.kill()
+    assert got == [[imu(1), b"bad"], [imu(2)]]
 
 
 def test_a_line_whose_device_is_there_is_told_when_it_is_needed(
