@@ -80,6 +80,7 @@ def table(**changed: Any) -> RouteTable:
         "endpoints": endpoints(),
         "listeners": {"rover": listener},
         "routes": (),
+        "envelopes": {},
         **changed,
     }
     return cast("RouteTable", SimpleNamespace(**told))
