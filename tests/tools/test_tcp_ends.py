@@ -208,3 +208,18 @@ routes:
         (datagram.listener, datagram.endpoint) for datagram in map(MirroredDatagram._make, mirrored)
     }
     assert inboxes["lander"].undecodable == 0
+
+
+@pytest.mark.parametrize("way", ["connect", "accept"])
+def test_a_router_gets_all_that_is_sent_before_the_end(tcp_path: Tables, way: str) -> None:
+    path = tcp_path(way)
+    origin = ["--from", "board"] if way == "accept" else []
+    program = check_table(path, {}).program
+    assert program is not None
+    mirrored = list[Mirrored]()
+    with Router(program) as router:
+        detach = router.mirror.attach(mirrored.extend)
+        assert main(["send", "every_kind", "i32=5", "--to", "tcp", "--count", "50", *origin, "-t", str(path)]) == 0
+        wait_until(lambda: len(mirrored) >= 50)
+        detach()
+    assert {MirroredDatagram._make(each).endpoint for each in mirrored} == {"board"}
