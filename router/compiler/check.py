@@ -222,9 +222,11 @@ def _envelope_findings(lookup: Lookup, routes: Iterable[CheckedRoute]) -> Iterat
     table = lookup.table
     for name in dict.fromkeys(name for checked in routes for name in _made_for(checked)):
         endpoint = table.endpoints.get(name)
-        if not table.envelopes or endpoint is None or (endpoint.beside and name not in lookup.beside):
+        if endpoint is None or (endpoint.beside and name not in lookup.beside):
             continue  # or `set` has findings already
-        envelope, settings = lookup.envelopes.to(name), table.envelopes[lookup.envelopes.endpoints[name]]
+        envelope, settings = lookup.envelopes.to(name), table.envelopes.get(lookup.envelopes.endpoints[name])
+        if settings is None:
+            continue  # the table has no such envelope
         empty = unfilled(envelope.beside, lookup.beside.get(name))
         for required in (member.name for member in empty if member.is_required):
             message = f"nothing fills '{required}', which {envelope.name} requires, in envelopes for '{name}'"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from router.errors import Code, Diagnostic, did_you_mean
@@ -14,9 +14,7 @@ from router.types.protobuf import lock_path
 def envelope_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for listeners and endpoints that name an unknown envelope, or none of several."""
     known = [name for name in table.envelopes if name]
-    deadmen = [route.deadman for route in table.routes if route.deadman]
-    recipients = {to.endpoint.value for route in table.routes for to in route.destinations}
-    recipients |= {to.value for deadman in deadmen for to in deadman.to}
+    recipients = _recipients(table)
     places: list[Listener | Endpoint] = [*table.listeners.values(), *table.endpoints.values()]
     for place in places:
         if place.envelope is not None:
@@ -27,6 +25,19 @@ def envelope_findings(table: RouteTable) -> Iterator[Diagnostic]:
         elif len(known) > 1 and (isinstance(place, Listener) or place.name in recipients):
             what = f"'{place.name}' does not say which envelope it has"
             yield Diagnostic(place.span, Code.MISSING_KEY, what, f"add `envelope: {' or '.join(known)}`")
+
+
+def _recipients(table: RouteTable) -> Collection[str]:
+    """Return the endpoints to which the router sends."""
+    deadmen = [route.deadman for route in table.routes if route.deadman]
+    replying = [route for route in table.routes if route.reply]
+    return {
+        *(to.endpoint.value for route in table.routes for to in route.destinations),
+        *(to.value for deadman in deadmen for to in deadman.to),
+        *(source.value for route in replying for source in route.sources),
+        *(service.request.to.value for service in table.services.values()),
+        *(call.source.source.value for call in table.called.values()),
+    }
 
 
 def shared_lock_findings(table: RouteTable) -> Iterator[Diagnostic]:

@@ -129,6 +129,9 @@ class Envelopes:
         """Return message and hint for the name of a payload case that does not exist."""
         if several := [each for label in self.by_name if (each := f"{label}.{name}") in self.numbers]:
             return f"several envelopes have the payload case '{name}'", f"write {' or '.join(several)}"
+        label, _, case = name.partition(".")
+        if label in self.by_name and case in self.by_name[label].numbers:
+            return f"'{label}' is the only envelope with the payload case '{case}'", f"write '{case}'"
         return f"{self.title} has no payload case '{name}'", did_you_mean(name, self.cases)
 
     @property
