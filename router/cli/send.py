@@ -27,7 +27,7 @@ _EXAMPLES = (
     "router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000",
     "router send imu_info -t routes/sim.yaml --to rover --from sensor_board",
     "router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation",
-    "router send detection frame=5 geometry length=9 envelope.camera=2 -t routes/vision.yaml --to vision",
+    "router send detection frame=5 geometry length=9 -t vision.yaml --to vision",
     "router send manual_drive --to rover --rate 20Hz --count 1000",
 )
 
