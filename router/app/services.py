@@ -10,7 +10,7 @@ import os
 import select
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from threading import RLock
@@ -138,9 +138,9 @@ class Services:
         assert change.image is not None  # noqa: S101 - prepared
         served, calling, program = change.services.served, change.services.calling, change.program
         with self._lock:
-            self._end()
-            unused: list[ServedService | CallingClient] = []
-            unused += [each for name, each in self._served.items() if served.get(name) is not each]
+            ending = [each for name, each in self._served.items() if served.get(name) is not each]
+            self._end(ending)
+            unused: list[ServedService | CallingClient] = [*ending]
             unused += [each for name, each in self._calling.items() if calling.get(name) is not each]
             change.services.unused = unused
             self._served, self._calling = served, calling
@@ -158,12 +158,19 @@ class Services:
         for unused in change.services.unused if change.services else ():
             unused.close()
 
-    def _end(self) -> None:
-        """End the open calls."""
-        if self._calls is not None and self._asking is not None:
-            self._calls.end(boottime_ns())
-            self._asking.end(boottime_ns())
-            self._note_open()
+    def _end(self, ending: Iterable[ServedService]) -> None:
+        """End the open calls, and those that wait for services that end."""
+        if self._calls is None or self._asking is None:
+            return
+        self._calls.end(boottime_ns())
+        self._asking.end(boottime_ns())
+        for served in ending:
+            try:
+                for request in served.waiting():
+                    self._calls.cancel(served.plan.label, (served, request), boottime_ns())
+            except RuntimeError as error:  # of rcl
+                logger.warning("calls that waited are lost", service=served.plan.name, problem=str(error))
+        self._note_open()
 
     def _acquire(self) -> None:
         if not self._lock.acquire(timeout=_PATIENCE_S):
@@ -282,7 +289,7 @@ class Services:
         if self._thread is not None and not join_or_abandon(self._thread):
             self._topics.leave_open()
             return
-        self._end()
+        self._end(self._served.values())
         for served in self._served.values():
             served.close()
         for client in self._calling.values():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -75,6 +77,10 @@ class ServedService:
         sent, received = header.source_timestamp, header.received_timestamp  # 0 if unknown to the middleware
         called_at = min(sent or received, received or sent) or wall_ns()
         return Request(serialize_message(request), header, called_at)
+
+    def waiting(self) -> Iterator[Request]:
+        """Take the requests that wait, not those that clients go on to send. Raises one of RCL_ERRORS."""
+        return islice(iter(self.take, None), MOST_WAITING)
 
     def answer(self, request: Request, response: bytes) -> None:
         """Send a response. Raises one of RCL_ERRORS."""

@@ -136,6 +136,10 @@ class Calls(Generic[Caller]):
                 self._open.remove(call)
                 self._end(call.plan, call.caller, lost if lost == "timed_out" else "unsent", call.began, now)
 
+    def cancel(self, label: str, caller: Caller, now: int) -> None:
+        """End a call that is not sent any more."""
+        self._end(self._plans[label], caller, "cancelled", now, now)
+
     def end(self, now: int) -> None:
         """End all calls."""
         calls, self._open = self._open, []

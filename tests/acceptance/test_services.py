@@ -283,6 +283,19 @@ def test_a_stop_ends_open_calls(link: Link) -> None:
     assert response.get(timeout=30)["message"] == "the router has reloaded its table, or stops"
 
 
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])
+def test_calls_that_wait_when_their_service_ends_are_answered(link: Link, how: signal.Signals) -> None:
+    link.board.behave = lambda _: []
+    link.clients.call(ARM, ON)
+    link.table.write_text(link.table.read_text().replace("  arm:\n", "  other:\n"))
+    with link.router.standing_still():
+        responses = [link.clients.begin(ARM, ON) for _ in range(4 * TYPICAL)]
+        sleep(1)  # until the calls are in the router's queue
+        link.router.process.send_signal(how)
+    text = "the router has reloaded its table, or stops"
+    assert [response.get(timeout=30)["message"] for response in responses] == [text] * (4 * TYPICAL)
+
+
 def test_a_board_that_is_gone_ends_calls_at_once(link: Link) -> None:
     link.board.opened.close()
     while link.clients.call(ARM, ON)["message"] != "arm_board cannot be sent to":
