@@ -51,7 +51,7 @@ def check_services(
         all_routes.append(service.request)
         sender = declared.reply.sender or declared.request.to
         add_target(lookup, all_routes, declared.reply.case, service.reply_case, sender, reply)
-    lookup.findings += _ambiguous(services)
+    lookup.findings += [*_ambiguous(services), *_alike(services)]
     return tuple(services), tuple(all_routes)
 
 
@@ -318,6 +318,17 @@ def _ambiguous(services: Iterable[CheckedService]) -> Iterator[Diagnostic]:
                 message = f"'{case}' from '{sender}' also answers '{several[0].declared.name}'"
                 hint = "give both services the same `match`, so that their replies can be told apart"
                 yield Diagnostic(service.declared.reply.span, Code.BAD_VALUE, message, hint)
+
+
+def _alike(services: Iterable[CheckedService]) -> Iterator[Diagnostic]:
+    """Yield a finding for each service that has the name of another one in ROS."""
+    named: dict[str, CheckedService] = {}
+    for service in services:
+        other = named.setdefault(service.ros_name, service).declared
+        if other is not service.declared:
+            message = f"'{service.declared.name}' and '{other.name}' are the same service in ROS, {service.ros_name}"
+            hint = f"remove one, for each call would get two responses: see {other.span}"
+            yield Diagnostic(service.declared.span, Code.BAD_VALUE, message, hint)
 
 
 # responses that the router gives itself
