@@ -209,9 +209,12 @@ def _changes(before: CompiledTable, after: CompiledTable) -> str:
     """Describe a reload in one line, for example `route imu_info changed, endpoint arm_board added`."""
     now, then = before.table, after.table
     found = [
+        *_differing("envelope", now.envelopes, then.envelopes),
         *_differing("listener", now.listeners, then.listeners),
         *_differing("endpoint", now.endpoints, then.endpoints),
         *_differing("route", _routes(now), _routes(then)),
+        *_differing("state", now.states, then.states),
+        *_differing("service", {**now.services, **now.called}, {**then.services, **then.called}),
         *_differing("gateway", now.gateways, then.gateways),
         *(["protos changed"] if before.protos_sha256 != after.protos_sha256 else []),
     ]
@@ -238,10 +241,12 @@ def _routes(table: RouteTable) -> Mapping[str, object]:
 
 
 def _differing(kind: str, now: Mapping[str, object], then: Mapping[str, object]) -> Iterator[str]:
+    """Yield what was added, removed or changed; `envelope` has no name."""
     for name in [*now, *(then.keys() - now.keys())]:
+        what = f"{kind} {name}".rstrip()
         if name not in now:
-            yield f"{kind} {name} added"
+            yield f"{what} added"
         elif name not in then:
-            yield f"{kind} {name} removed"
+            yield f"{what} removed"
         elif not are_same(now[name], then[name]):
-            yield f"{kind} {name} changed"
+            yield f"{what} changed"

@@ -386,6 +386,38 @@ def test_a_reload_that_moves_every_endpoint_is_warned_about(site: Site) -> None:
         ]
 
 
+def test_the_result_names_changed_states_services_and_envelopes(site: Site) -> None:
+    def written(valid_for: str = "5s", timeout: str = "1s", because: str = "") -> None:
+        path = site.write(
+            f"""\
+  control_mode: {{source: basestation}}
+state:
+  mode: {{case: control_mode, source: basestation, value: mode, initial: MODE_MANUAL, valid_for: {valid_for}}}
+services:
+  measure:
+    type: std_srvs/srv/Trigger
+    request: {{case: rock_measure_request, to: basestation, fields: {{x1: 1}}}}
+    reply: {{case: rock_measure_result, fields: {{success: length_cm > 0}}}}
+    timeout: {timeout}
+    on_timeout: {{message: reason}}
+"""
+        )
+        path.write_text(path.read_text().replace("oneof: payload", f"oneof: payload{because}"))
+        let_rest(path)
+
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    written()
+    program = check_table(site.folder / "table.yaml").program
+    assert program is not None
+    with Router(program) as router:
+        written(valid_for="6s")
+        assert router.reload().text == "state mode changed"
+        written(valid_for="6s", timeout="2s")
+        assert router.reload().text == "service measure changed"
+        written(valid_for="6s", timeout="2s", because=", because: a reason")
+        assert router.reload().text == "envelope changed"
+
+
 def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
