@@ -345,9 +345,9 @@ class Plane:
 
     # explaining events
 
-    def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
+    def _why_rejected(self, listener: str, reason: int, data: bytes, length: int) -> str:
         newest = next(reversed(self._programs.values()), None)
-        return why_rejected(newest, listener, data, length) if newest is not None else ""
+        return why_rejected(newest, listener, reason, data, length) if newest is not None else ""
 
     def _superseded(self, listener: str, data: bytes) -> str:
         newest = next(reversed(self._programs.values()), None)

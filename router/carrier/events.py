@@ -104,15 +104,15 @@ DeadmanEvents = Union[DeadmanChange, Answer, Evidence]
 class EventReader:
     """Converts records of `native/events.h` to reports.
 
-    `why_rejected(listener, data, length)` describes why a datagram was rejected, and `superseded(listener, data)` the
-    payloads of one that has several. `place(route, topic, target, generation,
-    place)` returns the place of the table that refused a message of `topic` (None: a datagram), or "".
+    `why_rejected(listener, reason, data, length)` describes why a datagram was rejected, and `superseded(listener,
+    data)` the payloads of one that has several. `place(route, topic, target, generation, place)` returns the place of
+    the table that refused a message of `topic` (None: a datagram), or "".
     """
 
     def __init__(
         self,
         names: Names,
-        why_rejected: Callable[[str, bytes, int], str],
+        why_rejected: Callable[[str, int, bytes, int], str],
         superseded: Callable[[str, bytes], str],
         place: Callable[[str, str | None, str, int, int], str],
     ) -> None:
@@ -174,7 +174,7 @@ class EventReader:
         if event.kind == EventKind.SUPERSEDED:
             detail = f"{sender}: {self._superseded(place, data)}"
             return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))
-        what = self._why_rejected(place, data, event.length)
+        what = self._why_rejected(place, event.reason, data, event.length)
         detail = sender + (f": {what}" if what else "")
         mismatch = Mismatch(place, host, what) if event.reason in _MISMATCHES and event.length else None
         report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)

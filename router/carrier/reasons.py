@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from router import datagrams
 from router.compiler.compiled_table import CompiledTable
-from router.declared import PLACE_ORDER
+from router.declared import PLACE_ORDER, Reason
 from router.table.model.endpoints import Framing
 
 
-def why_rejected(program: CompiledTable, listener: str, data: bytes, length: int) -> str:
+def why_rejected(program: CompiledTable, listener: str, reason: int, data: bytes, length: int) -> str:
     """Describe why a datagram of `length` bytes was rejected; `data` is all of it or its beginning."""
     plan = program.table.listeners.get(listener)
     if plan is None:
         return ""
-    if plan.accepts and not length:
+    if reason == Reason.SOURCE_MISMATCH and plan.accepts and not length:
         return f"a connection; no endpoint with `listener: {listener}` has this address"
     repairs = plan.framing is Framing.ZERO_TRIMMED
     return datagrams.why_rejected(program.envelopes.at(listener), data, length, repairs=repairs)

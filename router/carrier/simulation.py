@@ -164,8 +164,8 @@ class Simulation:
         assert running is not None  # noqa: S101 - a program was adopted
         return running
 
-    def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
-        return why_rejected(self._in_use.program, listener, data, length)
+    def _why_rejected(self, listener: str, reason: int, data: bytes, length: int) -> str:
+        return why_rejected(self._in_use.program, listener, reason, data, length)
 
     def _superseded(self, listener: str, data: bytes) -> str:
         return superseded(self._in_use.program, listener, data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -210,11 +210,19 @@ def test_boards_on_a_server_are_told_apart_by_their_addresses(site: Site) -> Non
 
 def test_a_connection_from_another_address_is_refused_and_counted(site: Site) -> None:
     with capture_logs() as log, Router(site.server()) as router:
-        stranger = site.connected("127.0.0.9")
-        wait_until(lambda: stranger.has_ended)
+        with suppress(ConnectionResetError):  # before `connect` has returned
+            stranger = site.connected("127.0.0.9")
+            wait_until(lambda: stranger.has_ended)
         wait_until(lambda: counted(router, "datagrams_rejected", "tcp", "source_mismatch") == 1)
         wait_until(lambda: any("has this address" in each.get("detail", "") for each in log))
         assert counted(router, "link_up", "board") == 0
+
+
+def test_a_bad_frame_of_a_board_is_not_said_to_be_a_stranger(site: Site) -> None:
+    with capture_logs() as log, Router(site.server()):
+        site.connected().socket.sendall(b"\xff\xff\xff\xff\x0f\x00")
+        wait_until(lambda: any(each.get("reason") == "bad_frame" for each in log))
+    assert [each["detail"] for each in log if each.get("reason") == "bad_frame"] == ["from 127.0.0.41"]
 
 
 def test_a_board_that_connects_again_is_the_one_that_counts(site: Site) -> None:
