@@ -43,6 +43,9 @@ LABELS = {
     "topic": "imu_data",
     "target": "imu_data",
     "endpoint": "sensor_board",
+    "address": "192.168.0.30:8",
+    "service": "arm",
+    "outcome": "answered",
     "policy": "reliability",
     "peer": "publisher",
     "type": "geometry_msgs/msg/Twist",
@@ -97,9 +100,8 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     monkeypatch.setattr("router.observe.responses.KEPT_SECONDS", 0)
     counters = Counters()
     counters.set_commands(LABELS["route"], LABELS["target"], are_commands=True)
-    indexes = {
-        metric.name: counters.index(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS
-    }
+    counted = {metric.name: metric.labels[:-1] if metric.kind == "origin" else metric.labels for metric in METRICS}
+    indexes = {name: counters.index(name, *(LABELS[label] for label in labels)) for name, labels in counted.items()}
     threads = [counters.fresh_counts(), counters.fresh_counts()]
     result = Scraped(indexes, threads, 0, LOOPBACK)
     computed = {"kernel_drops": lambda: [(["rover"], result.drops)]}
@@ -119,8 +121,14 @@ def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
         suffix = {"counter": "_total", "histogram": "_count"}.get(metric.kind, "")
         if metric.name == "endpoint_unheard_seconds":
             assert values["router_endpoint_unheard_seconds", labels] > 0
-        elif metric.kind != "age":
+        elif metric.kind not in ("age", "origin"):
             assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
+
+
+def test_an_address_that_was_learned_is_a_label(scraped: Scraped) -> None:
+    assert not any(name == "router_endpoint_learned" for name, _ in scraped.values())
+    scraped.threads[0][scraped.indexes["endpoint_learned"]] = 0xC0A8001E << 16 | 8
+    assert scraped.value("router_endpoint_learned") == 1
 
 
 def test_an_endpoint_is_unheard_until_it_is_heard_and_then_silent(scraped: Scraped) -> None:
