@@ -7,7 +7,7 @@ none: `request.NAME` reads them there. Each takes eight bytes, so whatever follo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from router.compiler.checked import CheckedCalled, CheckedRoute, CheckedSubscription, Target
@@ -19,7 +19,8 @@ from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.plan import Plan, Record, Unset
 from router.compiler.services import add_target, behind, feeds, service_type
-from router.errors import Code, Located, SourceSpan
+from router.compiler.topics import resolved
+from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.model.expressions import FieldMap
 from router.table.model.routes import Route
 from router.table.model.services import CalledService
@@ -55,7 +56,21 @@ def check_called(
         target = _request(lookup, declared, source, halves[0], kept)
         add_target(lookup, all_routes, declared.source.case, source, declared.source.source, target)
         all_routes.append(_replies(lookup, declared, reply, halves[1], kept))
+    lookup.findings += _type_clashes(lookup)
     return tuple(services), tuple(all_routes)
+
+
+def _type_clashes(lookup: Lookup) -> Iterator[Diagnostic]:
+    """Yield a finding for each service that is called with another type than elsewhere in the table."""
+    table = lookup.table
+    types = {resolved(each.name, table.node): each.type for each in table.services.values()}
+    for declared in table.called.values():
+        called = declared.call
+        other = types.setdefault(resolved(called.service.value, table.node), called.type)
+        if other.value != called.type.value:
+            message = f"'{called.service.value}' has the type {called.type.value} here, but {other.value} elsewhere"
+            hint = f"a service has one type in ROS: see {other.span}"
+            yield Diagnostic(called.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
 
 
 # values that are kept
