@@ -229,11 +229,11 @@ def test_a_serial_line_that_is_unplugged_is_an_alert_until_it_is_plugged_in(
     monitored: Monitored, prometheus: PrometheusServer
 ) -> None:
     def closed() -> list[str]:
-        return [labels["listener"] for labels in prometheus.firing("LinkClosed")]
+        return [labels["endpoint"] for labels in prometheus.firing("LinkClosed")]
 
     assert closed() == []
     monitored.drill.pull()
-    wait_until(lambda: closed() == ["drill_line"], "the alert")
+    wait_until(lambda: closed() == ["drill"], "the alert")
     monitored.drill.plug_in()
     wait_until(lambda: closed() == [], "the end of the alert")
 
