@@ -99,7 +99,7 @@ class Board:
         self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._near.setblocking(False)
         self._far.setblocking(False)
-        self.address: int = library.sender_open(self._near.fileno(), -1, 0, 0)
+        self.address: int = library.sender_open(self._near.fileno(), -1, 1, 1)
 
     def break_down(self) -> None:
         """Make sending fail from now on."""

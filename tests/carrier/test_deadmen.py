@@ -59,7 +59,7 @@ class Outlet:
         self._intact = stack.enter_context(self._near.dup())
         self._broken = os.open(os.devnull, os.O_WRONLY)
         stack.callback(os.close, self._broken)
-        self.address: int = library.sender_open(self._near.fileno(), -1, 0, 0)
+        self.address: int = library.sender_open(self._near.fileno(), -1, 1, 1)
         stack.callback(library.sender_close, self.address)
 
     def breaks(self, *, is_broken: bool) -> None:

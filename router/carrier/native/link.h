@@ -5,8 +5,8 @@
  *
  * The receive thread reads: `ready` is an epoll descriptor that stays the same while the link is closed and opened. Any
  * thread sends, through `sender`, as to a UDP destination, and never waits: what does not fit is lost with EAGAIN. At most
- * 10 ms of a line's time, or 4 KiB over TCP, wait in the kernel, so that a brake is not sent behind old commands. A brake that does not fit
- * waits in `rest`, behind a frame that is half written, and goes before everything else. */
+ * 10 ms of a line's time, or 4 KiB over TCP, wait in the kernel, so that a brake is not sent behind old commands. A brake that
+ * does not fit waits in `rest`, behind a frame that is half written, and goes before everything else. */
 #ifndef LINK_H
 #define LINK_H
 

@@ -54,7 +54,7 @@ int main(void) {
     static counter counters[COUNTERS], braked[COUNTERS];
     int pair[2];
     assert(!socketpair(AF_UNIX, SOCK_SEQPACKET, 0, pair));
-    struct sender *sender = sender_open(pair[0], -1, 0, 0);
+    struct sender *sender = sender_open(pair[0], -1, 1, 1);
     struct ring *events = ring_open(1 << 12);
     struct timers *timers = timers_open(braked, NULL);
     struct beside beside = {sequence_open(), &NUMBER, 1, 0};
