@@ -73,12 +73,13 @@ def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:
 
 
 def summary(table: RouteTable) -> str:
-    """Return `26 payload cases, 31 topics, 8 endpoints, 1 gateway`; kinds without any are omitted."""
+    """Return `26 payload cases, 31 topics, 2 services, 8 endpoints, 1 gateway`; kinds without any are omitted."""
     topics = sum(len(route.all_topics) for route in table.routes)
     cases = {route.case.value for route in table.routes}
     counts = {
         "payload case": len(cases),
         "topic": topics,
+        "service": len(table.services) + len(table.called),
         "endpoint": len(table.endpoints),
         "gateway": len(table.gateways),
     }
