@@ -121,6 +121,11 @@ class Simulation:
         number = self._in_use.topic_numbers[topic]
         self._library.simulation_message(self._opened.address, number, data, len(data), sent_at)
 
+    def send_again(self, topic: str, datagram: bytes) -> None:
+        """Send the datagram of a request again. `topic` is the label of its service."""
+        number = self._in_use.topic_numbers[topic]
+        self._library.simulation_send_again(self._opened.address, number, datagram, len(datagram))
+
     def advance(self, to: int) -> None:
         """Advance the clock to that time, and serve timers that become due. Never goes back."""
         self._library.simulation_advance(self._opened.address, to)

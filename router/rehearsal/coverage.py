@@ -12,7 +12,7 @@ from pathlib import Path
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute, Target
-from router.compiler.compiled_table import CompiledTable
+from router.compiler.compiled_table import CompiledTable, service_label
 from router.compiler.expressions.tree import Node
 from router.errors import SourceSpan
 from router.rehearsal.comparing import Outcome
@@ -26,9 +26,11 @@ from router.rehearsal.rehearsal import (
     Received,
     Rejected,
     Sent,
+    Unanswered,
 )
 from router.rehearsal.steps import Expected
 from router.table.model.routes import ANY
+from router.table.model.services import CalledService, Service
 
 KINDS = ("route", "target", "rejection")
 
@@ -115,6 +117,19 @@ def _items(checked: Checked, program: CompiledTable) -> Iterator[tuple[Key, Item
             yield ("queue_full", endpoint.name), Item("rejection", endpoint.span, gap)
     for route in routes:
         yield from _rejections(route)
+    yield from _of_services(checked)
+
+
+def _of_services(checked: Checked) -> Iterator[tuple[Key, Item]]:
+    """Yield what services have besides their routes and targets."""
+    for called in checked.called:
+        gap = f"no test has a response of {called.declared.name}"
+        yield ("response", service_label(called.declared.name)), Item("target", called.declared.reply.span, gap)
+    services: list[Service | CalledService] = [each.declared for each in checked.services]
+    services += [each.declared for each in checked.called]
+    for declared in services:
+        gap = f"no test has a call of {declared.name} that times out"
+        yield ("timed_out", service_label(declared.name)), Item("rejection", declared.on_timeout.span, gap)
 
 
 def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
@@ -169,6 +184,9 @@ def _keys(event: Event, expected: Expected) -> Iterator[Key]:
     match event:
         case Received():
             yield "route", event.route
+            yield "response", event.source
+        case Unanswered(outcome="timed_out"):
+            yield event.outcome, event.target
         case Sent() if any(delivery.is_compared for delivery in expected.sent.get(event.target, ())):
             yield "deadman" if event.by_deadman else "target", event.route, event.target
         case Published() if any(delivery.is_compared for delivery in expected.published.get(event.target, ())):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from router.compiler import Checked
-from router.compiler.checked import Target
-from router.compiler.compiled_table import CompiledTable
+from router.compiler.checked import CheckedCalled, CheckedService, Target
+from router.compiler.compiled_table import CompiledTable, service_label
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.datagrams import Wire
 from router.errors import DecodeError, SourceSpan
@@ -29,6 +29,7 @@ from router.rehearsal.rehearsal import (
     Sent,
     StateChanged,
     Superseded,
+    Unanswered,
 )
 from router.types.model import MessageType
 
@@ -55,20 +56,37 @@ class TableIndex:
                 *(target for subscription in route.subscriptions for target in subscription.targets),
             ):
                 self._targets.setdefault((route.route.name, target.label), []).append(target)
+        services: list[CheckedService | CheckedCalled] = [*checked.services, *checked.called]
+        self._services = {service_label(each.declared.name): each for each in services}
 
     def target(self, route: str, target: str, note: str = "the target") -> Related | None:
         targets = self._targets.get((route, target))
         return Related(targets[0].span, note) if targets else None
 
     def type(self, route: str, topic: str) -> MessageType | None:
-        """Return the type of a topic that a route publishes on."""
+        """Return the type of a topic that a route publishes on, or of the messages for a service."""
+        service = self._services.get(topic)
+        if service is not None:
+            return service.response_type if isinstance(service, CheckedService) else service.request_type
         return next((checked.type for checked in self._targets.get((route, topic), ())), None)
+
+    def delivery(self, target: str) -> str:
+        """Return what is done with a message for a topic, or for a service by its label."""
+        service = self._services.get(target)
+        if service is None:
+            return f"is published on {target}"
+        return f"{'answers' if isinstance(service, CheckedService) else 'calls'} {service.declared.name}"
+
+    def on_timeout(self, label: str) -> Related | None:
+        """Return what a service, by its label, answers without a reply."""
+        service = self._services.get(label)
+        return Related(service.declared.on_timeout.span, "the answer without a reply") if service else None
 
     def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
         """Return the target of this name in one of the `routes` that took a message, or else in any."""
         taken = [name for name in routes if name in self._routes]
         related = next((related for name in taken if (related := self.target(name, target))), None)
-        if related is None and taken:
+        if related is None and taken and target not in self._services:
             related = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
         return related or next((self.target(*key) for key in self._targets if key[1] == target), None)
 
@@ -139,8 +157,10 @@ class EventDescriber:
                 return self.index.obeyed(event.route)
             case Filtered():
                 return self.index.condition(event.route, event.target)
+            case Unanswered():
+                return self.index.on_timeout(event.target)
             case Sent() | Published() | Dropped() | Collected():
-                return self.index.target(event.route, event.target)
+                return self.index.target(event.route, event.target) or self.index.on_timeout(event.target)
         return None
 
     def summarize(self, events: Sequence[Event]) -> str:
@@ -157,7 +177,7 @@ class EventDescriber:
             case Published():
                 kind = self.index.type(event.route, event.target)
                 inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
-                return f"{at}{inside} is published on {event.target}"
+                return f"{at}{inside} {self.index.delivery(event.target)}"
             case Dropped():
                 return f"{at}a message for {event.target} is dropped as {event.reason}{in_brackets(event.detail)}"
             case Filtered():
@@ -170,7 +190,7 @@ class EventDescriber:
                 return f"{at}{event.listener} rejects a datagram as {event.reason}{in_brackets(event.detail)}"
             case Superseded():
                 return f"{at}{event.listener} uses only the last payload of a datagram{in_brackets(event.detail)}"
-            case DeadmanChanged() | Obeyed() | Disobeyed() | StateChanged():
+            case DeadmanChanged() | Obeyed() | Disobeyed() | StateChanged() | Unanswered():
                 return at + _of_change(event)
         raise AssertionError(event)
 
@@ -188,8 +208,10 @@ def _kind(event: Event) -> tuple[object, ...]:
     return type(event), *names
 
 
-def _of_change(event: DeadmanChanged | Obeyed | Disobeyed | StateChanged) -> str:
+def _of_change(event: DeadmanChanged | Obeyed | Disobeyed | StateChanged | Unanswered) -> str:
     match event:
+        case Unanswered():
+            return f"a call of {event.target} ends as {event.outcome}"
         case StateChanged(_, state, before, after, source):
             return f"state.{state} changes from {before} to {after}" + (f", set by {source}" if source else "")
         case DeadmanChanged():

@@ -1,7 +1,8 @@
 """A program on a simulated clock: messages go in, a list of events comes out.
 
 The library that drives the rover executes it (`carrier.simulation`). Every topic has a subscriber,
-and the network accepts everything. Gateways do not take part, and deadmen do not send at the start.
+and the network accepts everything. Gateways do not take part, and deadmen do not send at the start. Messages of
+services are mapped; `stage` pairs calls with replies.
 """
 
 from __future__ import annotations
@@ -51,11 +52,16 @@ class Sent(Event):
 
 @dataclass(frozen=True, slots=True)
 class Published(Event):
-    """A message for a topic, under the name that the table gives it; `data` are its CDR bytes."""
+    """A message for a topic, under the name that the table gives it; `data` are its CDR bytes.
+
+    With the label of a service as `target`, it is a reply, or a request of an endpoint. `leading` are then the bytes
+    that precede it in the carrier: the value of `match`, or what is kept for its reply.
+    """
 
     route: str
     target: str
     data: bytes
+    leading: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,14 @@ class Dropped(Event):
     target: str
     reason: str
     detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Unanswered(Event):
+    """A call of a service, here its label, has ended without a reply: with one of metrics.CALL_OUTCOMES."""
+
+    target: str
+    outcome: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +182,7 @@ class Rehearsal:
         self.ahead = 0
         self._data = b""
         self._simulation.adopt(program)
-        self._program, self._services = program, _services(program)
+        self._program, self._leading = program, _leading(program)
         self._series = _series(program)
         self._plans = {plan.name: plan for plan in program.states}
         self.states = self._initial()
@@ -187,10 +201,16 @@ class Rehearsal:
         self._read()
 
     def ros(self, topic: str, cdr: bytes, sent_ns: int | None = None) -> None:
-        """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one."""
-        if topic in self._services:
-            cdr = self._services[topic].behind(cdr)
+        """Take a message of a subscription, published at `sent_ns`. Raises KeyError for a topic without one.
+
+        With the label of a service, the message is as in the carrier, after a number or what is kept.
+        """
         self._simulation.message(topic, cdr, self._wall if sent_ns is None else sent_ns)
+        self._read()
+
+    def repeat(self, label: str, datagram: bytes) -> None:
+        """Send the datagram of a service's request again."""
+        self._simulation.send_again(label, datagram)
         self._read()
 
     def advance(self, to_ns: int) -> None:
@@ -206,7 +226,7 @@ class Rehearsal:
     def reload(self, program: CompiledTable) -> None:
         """Continue with another program, whose counters continue those of the current one."""
         self._simulation.adopt(program)
-        self._program, self._services = program, _services(program)
+        self._program, self._leading = program, _leading(program)
         self._series |= _series(program)
         self._plans = {plan.name: plan for plan in program.states}
         self.states = self._initial() | {name: value for name, value in self.states.items() if name in self._plans}
@@ -216,7 +236,6 @@ class Rehearsal:
         """Start again with the current program, as a router that has just started."""
         self._simulation.restart(self._start)
         self._at, self.ahead, self._data = self._start, 0, b""
-        self._services = _services(self._program)
         self.states = self._initial()
         self.events.clear()
 
@@ -230,8 +249,8 @@ class Rehearsal:
             match record:
                 case Time(at):
                     self._at = at
-                case Output(target, data):
-                    self._data = self._services[target].taken(data) if target in self._services else data
+                case Output(_, data):
+                    self._data = data
                 case Increment(counter, _):
                     self._count(counter)
                 case DeadmanChange(route, is_tripped):
@@ -257,7 +276,11 @@ class Rehearsal:
     def _count(self, counter: int) -> None:
         """Make an event from a counter: only counters have both the route and the target."""
         if (series := self._series.get(counter)) is not None:
-            self.events.append(EVENTS[series.metric](self._at, series.labels, self._data))
+            event = EVENTS[series.metric](self._at, series.labels, self._data)
+            if isinstance(event, Published) and event.target in self._leading:
+                data, end = event.data, HEADER + self._leading[event.target]
+                event = replace(event, data=data[:HEADER] + data[end:], leading=data[HEADER:end])
+            self.events.append(event)
 
     def _report(self, detail: str) -> None:
         """Add what is reported about the last count to its event."""
@@ -266,33 +289,10 @@ class Rehearsal:
             self.events[-1] = replace(event, detail=detail)
 
 
-class _Service:
-    """Adds to messages of a service what precedes them in the carrier, and removes it: the number of a call, or what is
-    kept of the last message that called it.
-    """
-
-    def __init__(self, kept: int, *, is_numbered: bool) -> None:
-        self._size, self._is_numbered = kept, is_numbered
-        self._first = bytes(kept)
-
-    def behind(self, message: bytes) -> bytes:
-        if self._is_numbered:
-            self._first = (int.from_bytes(self._first, "little") + 1).to_bytes(self._size, "little")
-        return message[:HEADER] + self._first + message[HEADER:]
-
-    def taken(self, message: bytes) -> bytes:
-        end = HEADER + self._size
-        if not self._is_numbered:
-            self._first = message[HEADER:end]
-        return message[:HEADER] + message[end:]
-
-
-def _services(program: CompiledTable) -> dict[str, _Service]:
-    """Return the services of a program by what stands for them in place of topics."""
-    services = {plan.label: _Service(SIZE_OF_NUMBER, is_numbered=True) for plan in program.services}
-    for plan in program.called:
-        services[plan.label] = services[plan.failed] = _Service(plan.kept, is_numbered=False)
-    return services
+def _leading(program: CompiledTable) -> dict[str, int]:
+    """Return how many bytes precede the messages of each service, by its label."""
+    leading = {plan.label: SIZE_OF_NUMBER for plan in program.services}
+    return leading | {plan.label: plan.kept for plan in program.called}
 
 
 def _series(program: CompiledTable) -> dict[int, Series]:

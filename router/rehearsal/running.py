@@ -1,4 +1,4 @@
-"""Runs table tests, each on a rehearsal of its table, step by step."""
+"""Runs table tests, each on a stage for its table, step by step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from router.rehearsal.comparing import Comparison, Failure, Outcome
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.fields import protobuf_message, ros_values
 from router.rehearsal.reading import TableTest, TestFile
-from router.rehearsal.rehearsal import START, Rehearsal
+from router.rehearsal.rehearsal import START
+from router.rehearsal.stage import Stage
 from router.rehearsal.steps import Given, Step
 from router.table.reading import InvalidValueError
 
@@ -44,18 +45,18 @@ class Result:
 
 def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) -> list[Result]:
     """Run the tests of a file whose name contains `only`, and record what they touch in `coverage`."""
-    comparison, rehearsal = Comparison(file.checked, file.program), Rehearsal(file.program)
-    return [_run(test, file.program, rehearsal, comparison, coverage) for test in file.tests if only in test.name]
+    comparison, stage = Comparison(file.checked, file.program), Stage(file.program)
+    return [_run(test, file.program, stage, comparison, coverage) for test in file.tests if only in test.name]
 
 
 def _run(
-    test: TableTest, program: CompiledTable, rehearsal: Rehearsal, comparison: Comparison, coverage: Coverage | None
+    test: TableTest, program: CompiledTable, stage: Stage, comparison: Comparison, coverage: Coverage | None
 ) -> Result:
     result = Result(test)
-    rehearsal.restart()
+    stage.restart()
     for step in test.steps:
         try:
-            outcome = _run_step(step, rehearsal, program)
+            outcome = _run_step(step, stage, program)
         except InvalidValueError as error:
             result.findings.append(error.diagnostic)
             return result
@@ -68,32 +69,38 @@ def _run(
     return result
 
 
-def _run_step(step: Step, rehearsal: Rehearsal, program: CompiledTable) -> Outcome:
-    rehearsal.events.clear()
-    begin = rehearsal.now if step.at is None else START + step.at
-    rehearsal.advance(begin)
-    given = _give(step.given, rehearsal, Wire(program.envelopes)) if step.given else []
+def _run_step(step: Step, stage: Stage, program: CompiledTable) -> Outcome:
+    stage.events.clear()
+    begin = stage.now if step.at is None else START + step.at
+    stage.advance(begin)
+    given = _give(step.given, stage, Wire(program.envelopes)) if step.given else []
     if step.until is not None:
-        rehearsal.advance(START + step.until)
+        stage.advance(START + step.until)
     if step.stop:
-        rehearsal.close()
-    early = [event for event in rehearsal.events if event.at < begin]
-    return Outcome(step, early, rehearsal.events[len(early) :], given, dict(rehearsal.states))
+        stage.close()
+    early = [event for event in stage.events if event.at < begin]
+    return Outcome(step, early, stage.events[len(early) :], given, dict(stage.states))
 
 
-def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, bytes]]:
-    """Give a step's message to the rehearsal. Return the times and bytes of what was given."""
+def _give(given: Given, stage: Stage, wire: Wire) -> list[tuple[int, bytes]]:
+    """Give a step's message to the stage. Return the times and bytes of what was given."""
     arrived: list[tuple[int, bytes]] = []
-    begin = rehearsal.now
+    begin = stage.now
     for number in range(given.times):
-        rehearsal.advance(begin + number * given.every)
-        now = rehearsal.now
+        stage.advance(begin + number * given.every)
+        now = stage.now
         if given.topic is not None:
             data = _message(given, now)
-            rehearsal.ros(given.topic, data, now - given.age)
+            stage.ros(given.topic, data, now - given.age)
+        elif given.call is not None:
+            data = _message(given, now)
+            stage.call(given.call, data, now - given.age)
+        elif given.answer is not None:
+            data = _message(given, now)
+            stage.respond(given.answer, data)
         else:
             data = _datagram(given, wire, now)
-            rehearsal.datagram(given.listener, given.peer, data, now - given.age)
+            stage.datagram(given.listener, given.peer, data, now - given.age)
         arrived.append((now, data))
     return arrived
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from router.compiler import Checked
-from router.compiler.called import UNANSWERED
+from router.compiler.checked import CheckedCalled, CheckedService
 from router.compiler.compiled_table import CompiledTable, StatePlan, service_label
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
@@ -20,6 +20,7 @@ from router.compiler.resolution import stand_in
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.fields import ANY, FieldReader, Fields
+from router.rehearsal.stage import UNMATCHED
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
@@ -37,13 +38,16 @@ Counts = Mapping[str, int]
 class Given:
     """A message that arrives `times` times, `every` ns, each sent `age` ns before.
 
-    With a `topic` it is a ROS message, else a datagram from `peer` at `listener`. The content of a message is `fields`,
-    that of a datagram `payloads`, by payload case, and `beside` of the envelope; or either has the bytes `data`. `pad`
-    in bytes, 0 for none.
+    With a `topic` it is a ROS message, with `call` the request of a client, with `answer` the response of a server,
+    both by the label of their service. Otherwise it is a datagram from `peer` at `listener`. The content of a message
+    is `fields`, that of a datagram `payloads`, by payload case, and `beside` of the envelope; or either has the bytes
+    `data`. `pad` in bytes, 0 for none.
     """
 
     span: SourceSpan
     topic: str | None = None
+    call: str | None = None
+    answer: str | None = None
     peer: Peer = ("", 0)
     listener: str = ""
     payloads: Sequence[tuple[PayloadCase, Fields]] = ()
@@ -85,6 +89,8 @@ Deliveries = Mapping[str, tuple[Delivery, ...]]
 @dataclass(frozen=True, slots=True)
 class Expected:
     """Everything that may happen in a step. With `anything`, nothing is compared.
+
+    `published` also has what `answered` and `called` expect, by the label of the service.
 
     `rejected`, `filtered` and `route` are None if the test does not mention them. `obeyed` and `disobeyed` count
     endpoints that begin to obey the brake of a deadman, or to disobey it. `states` are at the end of the step, as the
@@ -210,14 +216,41 @@ class Names:
     def route(self, name: str, span: SourceSpan) -> str:
         return self._known(name, [route.name for route in self._table.routes if not route.ignore], span, "route")
 
-    def published(self, name: str, span: SourceSpan) -> MessageType:
-        return self._published[self._known(name, self._published, span, "route that publishes on")]
+    def published(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Return a topic with its type."""
+        topics = [topic for topic in self._published if topic not in self._labels]
+        return self._known(name, topics, span, "route that publishes on"), self._published[name]
 
-    def subscribed(self, name: str, span: SourceSpan) -> MessageType:
-        return self._subscribed[self._known(name, self._subscribed, span, "route from the topic")]
+    def subscribed(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Return a topic with its type."""
+        return self._known(name, self._subscribed, span, "route from the topic"), self._subscribed[name]
+
+    def request(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Return the label of a service that an endpoint answers, with the type of its requests."""
+        return service_label(name), self._service(name, span).request_type
+
+    def response(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Likewise, with the type of its responses."""
+        return service_label(name), self._service(name, span).response_type
+
+    def _service(self, name: str, span: SourceSpan) -> CheckedService:
+        services = {each.declared.name: each for each in self._checked.services}
+        return services[self._known(name, services, span, "service that an endpoint answers:")]
+
+    def called_request(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Return the label of a service that an endpoint calls, with the type of its requests."""
+        return service_label(name), self._called(name, span).request_type
+
+    def called_response(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
+        """Likewise, with the type of its responses."""
+        return service_label(name), self._called(name, span).response_type
+
+    def _called(self, name: str, span: SourceSpan) -> CheckedCalled:
+        services = {each.declared.name: each for each in self._checked.called}
+        return services[self._known(name, services, span, "service that an endpoint calls:")]
 
     def target(self, name: str, span: SourceSpan) -> str:
-        """Return an endpoint or a topic that a route delivers to, or a state as `state.NAME`."""
+        """Return an endpoint or a topic that a route delivers to, a state as `state.NAME`, or likewise a service."""
         states = [state.label for state in self._program.states]
         return self._known(name, [*self._destinations, *self._published, *states], span, "route to")
 
@@ -239,10 +272,12 @@ class Names:
         subscriptions = [subscription for route in self._checked.routes for subscription in route.subscriptions]
         subscriptions += [state.feed for state in self._checked.states.values() if state.feed is not None]
         types = {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
-        types |= {service_label(each.declared.name): each.request_type for each in self._checked.services}
-        for plan, called in zip(self._program.called, self._checked.called, strict=True):
-            types |= {plan.label: called.response_type, plan.failed: UNANSWERED}
-        return types
+        of_services = {*self._labels, *(plan.failed for plan in self._program.called)}
+        return {topic: kind for topic, kind in types.items() if topic not in of_services}
+
+    @cached_property
+    def _labels(self) -> Collection[str]:
+        return {*(plan.label for plan in self._program.services), *(plan.label for plan in self._program.called)}
 
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)
@@ -257,7 +292,8 @@ class Names:
 
 
 _KEYS_OF_DATAGRAMS = ("case", "fields", "cases", "envelope", "from", "listener", "trim", "pad")
-_KEYS_OF_MESSAGES = ("topic", "message")
+_MESSAGES = {"topic": ("message", "a ROS message"), "call": ("request", "a call"), "answer": ("response", "an answer")}
+"""What arrives from ROS: the key that names it, the key of its content, and what it is."""
 
 
 class GivenReader:
@@ -269,18 +305,18 @@ class GivenReader:
         """Read the given message of a step. Raises InvalidValueError."""
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
         span = next(iter(node.entries.values())).key.span if node.entries else node.span
-        topic = optional_text(node, "topic")
-        return self._datagram(span, node) if topic is None else self._message(span, node, topic)
+        key = next((key for key in _MESSAGES if key in node.entries), None)
+        return self._datagram(span, node) if key is None else self._message(span, node, key)
 
     def _datagram(self, span: SourceSpan, node: MappingNode) -> Given:
-        _refuse(node, ("message",), "a datagram", _KEYS_OF_DATAGRAMS)
+        _refuse(node, [content for content, _ in _MESSAGES.values()], "a datagram", _KEYS_OF_DATAGRAMS)
         sender = optional_text(node, "from")
         if sender is None:
             raise InvalidValueError(span, Code.MISSING_KEY, "this datagram has no sender", "add 'from: ENDPOINT'")
         data, forms = _hex(node), [key for key in ("case", "cases", "hex") if key in node.entries]
         if len(forms) != 1:
             message = "write a datagram as 'case' with 'fields', as 'cases' or as 'hex', a ROS message with 'topic'"
-            raise InvalidValueError(span, Code.BAD_VALUE, message)
+            raise InvalidValueError(span, Code.BAD_VALUE, message, "services have 'call' and 'answer'")
         for key, needed in (("fields", ["case"]), ("envelope", ["case", "cases"])):
             if (entry := node.entries.get(key)) and forms[0] not in needed:
                 raise InvalidValueError(entry.key.span, Code.UNKNOWN_KEY, f"'{key}' needs 'case'")
@@ -310,21 +346,37 @@ class GivenReader:
             case = self._names.case(name, entry.key.span)
             yield case, self._content(case.type, entry.value, entry.key.span)
 
-    def _message(self, span: SourceSpan, node: MappingNode, topic: Located[str]) -> Given:
-        _refuse(node, _KEYS_OF_DATAGRAMS, "a ROS message", _KEYS_OF_MESSAGES)
-        kind = self._names.subscribed(topic.value, topic.span)
-        data, message = _hex(node), node.get("message")
+    def _message(self, span: SourceSpan, node: MappingNode, key: str) -> Given:
+        content, what = _MESSAGES[key]
+        others = [*_MESSAGES, *(other for other, _ in _MESSAGES.values()), *_KEYS_OF_DATAGRAMS]
+        refused = [other for other in others if other not in {key, content}]
+        _refuse(node, [*refused, "age"] if key == "answer" else refused, what, (key, content))
+        named = optional_text(node, key)
+        assert named is not None  # noqa: S101 - the key is there
+        find = {"topic": self._names.subscribed, "call": self._names.request, "answer": self._names.called_response}
+        name, kind = find[key](named.value, named.span)
+        data, message = _hex(node), node.get(content)
         if data is not None and message is not None:
-            raise InvalidValueError(span, Code.BAD_VALUE, "a ROS message has 'message' or 'hex', not both")
-        fields = self._content(kind, message, topic.span) if data is None else None
+            raise InvalidValueError(span, Code.BAD_VALUE, f"{what} has '{content}' or 'hex', not both")
+        fields = self._content(kind, message, named.span) if data is None else None
         times, every, age = _repetition(node)
-        return Given(span, topic.value, fields=fields, data=data, times=times, every=every, age=age)
+        return Given(
+            span,
+            topic=name if key == "topic" else None,
+            call=name if key == "call" else None,
+            answer=name if key == "answer" else None,
+            fields=fields,
+            data=data,
+            times=times,
+            every=every,
+            age=age,
+        )
 
     def _content(self, kind: MessageType, node: Node | None, span: SourceSpan) -> Fields:
         return self._fields.message(kind, node) if node else Fields(kind, {}, span)
 
 
-def _refuse(node: MappingNode, names: tuple[str, ...], what: str, known: tuple[str, ...]) -> None:
+def _refuse(node: MappingNode, names: Iterable[str], what: str, known: tuple[str, ...]) -> None:
     for name in names:
         if entry := node.entries.get(name):
             hint = f"its keys are {', '.join((*known, 'hex'))}"
@@ -355,6 +407,9 @@ def _hex(node: MappingNode) -> bytes | None:
 
 _MOST = 100_000
 
+_Find = Callable[[str, SourceSpan], tuple[str, MessageType]]
+"""Finds the target and the type of messages by the name that a test uses."""
+
 
 class ExpectedReader:
     def __init__(self, names: Names) -> None:
@@ -371,7 +426,11 @@ class ExpectedReader:
         return Expected(
             span=span,
             sent=self._sent(node.get("sent"), given),
-            published=self._published(node.get("published"), given),
+            published={
+                **self._published(node.get("published"), given, self._names.published),
+                **self._published(node.get("answered"), given, self._names.response),
+                **self._published(node.get("called"), given, self._names.called_request),
+            },
             dropped=self._dropped(node.get("dropped")),
             rejected=Located(_reasons(rejected.value, REJECT_REASONS), rejected.key.span) if rejected else None,
             filtered=self._counted(node.entries.get("filtered"), self._names.target),
@@ -422,12 +481,13 @@ class ExpectedReader:
         fields = None if _is(entry.value, ANY) else self._content(case.type, entry.value, given)
         return Delivery(entry.key.span, case=case, fields=fields, beside=beside)
 
-    def _published(self, node: Node | None, given: Node | None) -> Deliveries:
+    def _published(self, node: Node | None, given: Node | None, find: _Find) -> Deliveries:
         deliveries: dict[str, tuple[Delivery, ...]] = {}
         for name, entry in node.entries.items() if isinstance(node, MappingNode) else ():
-            kind, span = self._names.published(name, entry.key.span), entry.key.span
-            listed = _listed(entry.value)
-            deliveries[name] = tuple(delivery for one in listed for delivery in self._messages(kind, span, one, given))
+            span, listed = entry.key.span, _listed(entry.value)
+            target, kind = find(name, span)
+            found = (delivery for one in listed for delivery in self._messages(kind, span, one, given))
+            deliveries[target] = tuple(found)
         return deliveries
 
     def _messages(self, kind: MessageType, span: SourceSpan, node: Node, given: Node | None) -> Sequence[Delivery]:
@@ -444,13 +504,14 @@ class ExpectedReader:
             return self._fields.message(kind, node)
         if not isinstance(given, MappingNode) or given.entries.keys() & {"hex", "cases"}:
             raise InvalidValueError(node.span, Code.BAD_VALUE, "'unchanged' needs fields that are given in this step")
-        fields = given.get("fields") or given.get("message")
+        contents = ["fields", *(content for content, _ in _MESSAGES.values())]
+        fields = next((given.get(content) for content in contents if content in given.entries), None)
         return self._given.message(kind, fields) if fields else Fields(kind, {}, node.span)
 
     def _dropped(self, node: Node | None) -> Mapping[str, Located[Counts]]:
-        entries = node.entries.items() if isinstance(node, MappingNode) else ()
+        entries, known = node.entries.items() if isinstance(node, MappingNode) else (), (*DROP_REASONS, UNMATCHED)
         return {
-            self._names.target(name, entry.key.span): Located(_reasons(entry.value, DROP_REASONS), entry.key.span)
+            self._names.target(name, entry.key.span): Located(_reasons(entry.value, known), entry.key.span)
             for name, entry in entries
         }
 
@@ -498,7 +559,7 @@ def _of_word(node: ScalarNode, given: Node | None) -> Delivery:
 
 
 def _unchanged(span: SourceSpan, given: Node | None) -> Delivery:
-    if not isinstance(given, MappingNode) or "topic" in given.entries:
+    if not isinstance(given, MappingNode) or given.entries.keys() & _MESSAGES.keys():
         message = "'unchanged' needs a datagram that is given in this step"
         raise InvalidValueError(span, Code.BAD_VALUE, message, "write {ENDPOINT: {CASE: {FIELD: value}}}")
     return Delivery(span, is_unchanged=True)

@@ -240,6 +240,7 @@ def test_a_folder_that_cannot_be_read_is_wrong_usage(
     assert f"the folder '{tmp_path}' cannot be read: Permission denied" in capsys.readouterr().err
 
 
+SERVICES = REPOSITORY / "tests" / "rehearsal" / "tables" / "services.yaml"
 LISTED = """
 version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
@@ -266,11 +267,12 @@ def test_examples_of_the_documentation_pass(tmp_path: Path, rover: Path) -> None
     listed.write_text(LISTED.replace("PROTOS", str(PROTOS)))
     for number, example in enumerate(examples):
         table = listed if "max_rate" in example or "incomplete" in example else rover
+        table = SERVICES if "call:" in example else table
         path = tmp_path / f"example-{number}.test.yaml"
         path.write_text(f"table: {table}\n{example}")
         results = run_tests(read_test_file(path, DEFINITIONS))
         assert [result.failures for result in results if not result.passed] == []
-    assert len(examples) == 3
+    assert len(examples) == 4
 
 
 def test_schema_is_one_and_describes_every_key() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from textwrap import dedent, indent
 
@@ -568,6 +569,100 @@ def test_folder_stands_for_its_test_files(tmp_path: Path) -> None:
     ]
 
 
+# services
+
+CALLS = f"""
+version: 1
+extends: {Path(__file__).parent / "tables" / "services.yaml"}
+"""
+CALLED = "{call: arm, request: {data: true}}"
+
+
+def of_services(folder: Path, *steps: str) -> TestFile:
+    (folder / "calls.yaml").write_text(CALLS)
+    path = folder / "calls.test.yaml"
+    path.write_text("tests:\n  a:\n    steps:\n" + "".join(f"      - {step}\n" for step in steps))
+    return read_test_file(path, DEFINITIONS)
+
+
+def said_of_services(folder: Path, *steps: str) -> list[tuple[str, str | None]]:
+    """What is said, and the text of the table with it."""
+    (result,) = run_tests(of_services(folder, *steps))
+    found = []
+    for failure in result.failures:
+        span = failure.table.span if failure.table else None
+        line = Path(span.file).read_text().splitlines()[span.line - 1] if span else ""
+        found.append((failure.message, line[span.column - 1 : span.end_column - 1] if span else None))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("step", "said", "place"),
+    [
+        (f"{{given: {CALLED}, expect: nothing}}",
+         "arm_request {armed: true, id: 1} is sent to arm_board; it is not expected", "arm_board"),
+        (f"{{given: {CALLED}, expect: {{sent: {{arm_board: {{arm_request: any}}}}, answered: {{arm: any}}}}}}",
+         "nothing for service.arm", "reply"),
+        ("{given: {case: arm_reply, from: arm_board, envelope: {req_id: 9}}, expect: nothing}",
+         "dropped for service.arm: unmatched, not nothing (number 9)", "reply"),
+        ("{given: {call: arm, age: 1s}, expect: {dropped: {arm_board: stale}}}",
+         "{message: 'the request is too old, or arm_board cannot take its values'} answers arm; it is not expected",
+         "on_timeout"),
+        ("{given: {call: tool, times: 2}, expect: {sent: {arm_board: any}, answered: {tool: {message: busy}}}}",
+         "service.tool: message is 'arm_board has not replied to an earlier call', not 'busy'", "on_timeout"),
+        ("{given: {case: home_request, from: arm_board, fields: {fast: true}}, expect: nothing}",
+         "{data: true} calls ask_home; it is not expected", "call"),
+        ("{given: {case: home_request, from: arm_board, fields: {fast: true}}, expect: {called: {ask_home: {}}}}",
+         "service.ask_home: data is true, not at its default", "fast"),
+    ],
+)  # fmt: skip
+def test_a_difference_of_a_service_is_named(step: str, said: str, place: str, tmp_path: Path) -> None:
+    assert said_of_services(tmp_path, step) == [(said, place)]
+
+
+def test_what_happens_between_steps_includes_the_end_of_calls(tmp_path: Path) -> None:
+    steps = f"{{given: {CALLED}, until: 600ms, expect: any}}", "{at: 2s, expect: nothing}"
+    message = (
+        "before this step, at 1 s {message: 'arm_board did not reply within 500 ms'} answers arm; no step expects it"
+    )
+    assert said_of_services(tmp_path, *steps) == [(message, "on_timeout")]
+
+
+def test_what_happened_says_how_calls_ended(tmp_path: Path) -> None:
+    (result,) = run_tests(of_services(tmp_path, f"{{given: {CALLED}, until: 1s, expect: nothing}}"))
+    (step,) = result.failed
+    assert "at 1 s a call of service.arm ends as timed_out" in step.events[-1]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("{call: arn}", "calls.yaml has no service that an endpoint answers: 'arn'"),
+        ("{call: ask_home}", "calls.yaml has no service that an endpoint answers: 'ask_home'"),
+        ("{answer: arm}", "calls.yaml has no service that an endpoint calls: 'arm'"),
+        ("{topic: service.arm}", "calls.yaml has no route from the topic 'service.arm'"),
+        ("{call: arm, response: {success: true}}", "a call has no key 'response'"),
+        ("{call: arm, topic: arm}", "a ROS message has no key 'call'"),
+        ("{answer: ask_home, age: 1s}", "an answer has no key 'age'"),
+        ("{call: arm, request: {}, hex: '00'}", "a call has 'request' or 'hex', not both"),
+        ("{case: arm_reply, from: arm_board, request: {data: true}}", "a datagram has no key 'request'"),
+    ],
+)
+def test_a_mistake_in_a_call_is_found(given: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TableError) as raised:
+        of_services(tmp_path, f"{{given: {given}, expect: any}}")
+    assert [found.message for found in raised.value.diagnostics] == [message]
+
+
+@pytest.mark.parametrize(
+    "expected",
+    ["answered: {ask_home: any}", "called: {arm: any}", "published: {service.arm: any}"],
+)
+def test_a_service_is_expected_in_its_direction(expected: str, tmp_path: Path) -> None:
+    with pytest.raises(TableError, match=r"calls\.yaml has no "):
+        of_services(tmp_path, f"{{expect: {{{expected}}}}}")
+
+
 # coverage
 
 
@@ -668,6 +763,32 @@ def test_deadman_is_a_target(tmp_path: Path) -> None:
             - {{at: 500ms, expect: {{sent: {{driving_board: {{manual_brake: {{brake: true}}}}}}}}}}
         """
     assert gaps(tmp_path, DRIVE, tests) == [("rejection", "200ms")]
+
+
+def test_a_service_needs_a_call_a_reply_and_one_without(tmp_path: Path) -> None:
+    call = f"{{given: {CALLED}, expect: {{sent: {{arm_board: {{arm_request: {{armed: true, id: 1}}}}}}}}}}"
+    reply = (
+        "{given: {case: arm_reply, from: arm_board, fields: {ok: true}, envelope: {req_id: 1}}, "
+        "expect: {answered: {arm: {success: true}}}}"
+    )
+    late = "{at: 500ms, expect: {sent: {arm_board: any}}}", "{at: 1s, expect: {answered: {arm: {message: any}}}}"
+    asked = "{given: {case: home_request, from: arm_board}, expect: {called: {ask_home: {}}}}"
+    response = "{given: {answer: ask_home}, expect: {sent: {arm_board: {home_reply: {}}}}}"
+    unanswered = "{at: 1s, expect: {sent: {arm_board: {home_reply: {}}}}}"
+
+    def missing(name: str, *steps: str) -> list[str]:
+        file = of_services(tmp_path, *steps)
+        coverage = Coverage(file.checked, file.program)
+        assert all(result.passed for result in run_tests(file, coverage=coverage))
+        return [gap.gap for gap in coverage.gaps() if re.search(rf"\b{name}\b", gap.gap)]
+
+    timed_out = "no test has a call of arm that times out"
+    stale = "no test has a message of service.arm that is older than this"
+    no_reply = "no test checks what arm_reply delivers to service.arm"
+    assert missing("arm", call, reply) == [stale, timed_out]
+    assert missing("arm", call, *late) == [no_reply, stale]
+    assert missing("ask_home", asked, response) == ["no test has a call of ask_home that times out"]
+    assert missing("ask_home", asked, unanswered) == ["no test has a response of ask_home"]
 
 
 def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:

@@ -187,6 +187,14 @@ void simulation_message(struct simulation *simulation, uint32_t topic, const voi
     route_ros_message(&simulation->ros, &simulation->topics[topic], &taken);
 }
 
+void simulation_send_again(struct simulation *simulation, uint32_t topic, const void *data, size_t size) {
+    const struct ros_route *route = &simulation->topics[topic].routes[0];
+    struct target again = route->targets.targets[0];
+    again.beside = NULL; /* it is filled already */
+    env_count(&simulation->ros.env, route->received, 1);
+    deliver_now(&simulation->ros.env, &route->targets, &again, data, size, NEVER, simulation->now);
+}
+
 /* ---- time ---- */
 
 static int64_t next_due(struct simulation *simulation) {

@@ -53,6 +53,9 @@ void simulation_datagram(struct simulation *simulation, uint32_t listener, uint3
                         size_t size, int64_t arrived_at);
 void simulation_message(struct simulation *simulation, uint32_t topic, const void *data, size_t size, int64_t sent_at);
 
+/* Send the datagram of a request again, as `requests_send_again` does. */
+void simulation_send_again(struct simulation *simulation, uint32_t topic, const void *data, size_t size);
+
 /* Advance the clock to that time, and serve timers that become due. Never goes back. */
 void simulation_advance(struct simulation *simulation, int64_t to);
 
