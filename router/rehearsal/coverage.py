@@ -122,9 +122,6 @@ def _items(checked: Checked, program: CompiledTable) -> Iterator[tuple[Key, Item
 
 def _of_services(checked: Checked) -> Iterator[tuple[Key, Item]]:
     """Yield what services have besides their routes and targets."""
-    for called in checked.called:
-        gap = f"no test has a response of {called.declared.name}"
-        yield ("response", service_label(called.declared.name)), Item("target", called.declared.reply.span, gap)
     services: list[Service | CalledService] = [each.declared for each in checked.services]
     services += [each.declared for each in checked.called]
     for declared in services:
@@ -184,7 +181,6 @@ def _keys(event: Event, expected: Expected) -> Iterator[Key]:
     match event:
         case Received():
             yield "route", event.route
-            yield "response", event.source
         case Unanswered(outcome="timed_out"):
             yield event.outcome, event.target
         case Sent() if any(delivery.is_compared for delivery in expected.sent.get(event.target, ())):

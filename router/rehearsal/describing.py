@@ -49,6 +49,8 @@ class TableIndex:
 
     def __init__(self, checked: Checked) -> None:
         self._routes = {route.route.name: route for route in checked.routes}
+        services: list[CheckedService | CheckedCalled] = [*checked.services, *checked.called]
+        self._services = {service_label(each.declared.name): each for each in services}
         self._targets: dict[tuple[str, str], list[Target]] = {}
         for route in checked.routes:
             for target in (
@@ -56,8 +58,10 @@ class TableIndex:
                 *(target for subscription in route.subscriptions for target in subscription.targets),
             ):
                 self._targets.setdefault((route.route.name, target.label), []).append(target)
-        services: list[CheckedService | CheckedCalled] = [*checked.services, *checked.called]
-        self._services = {service_label(each.declared.name): each for each in services}
+            if route.route.name in self._services:  # its replies without a response are a topic of their own
+                for subscription in route.subscriptions:
+                    for target in subscription.targets:
+                        self._targets[subscription.topic.topic.value, target.label] = [target]
 
     def target(self, route: str, target: str, note: str = "the target") -> Related | None:
         targets = self._targets.get((route, target))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 from router.compiler.compiled_table import ANSWERED, CalledPlan, CompiledTable, ServicePlan
 from router.rehearsal.rehearsal import Dropped, Event, Published, Rehearsal, Sent, Unanswered
@@ -132,10 +133,17 @@ class Stage(Rehearsal):
         return self._asked[plan.label]
 
     def reply(self, plan: CalledPlan, message: bytes, *, is_response: bool) -> bool:
-        before = len(self.events)
-        self.ros(plan.label if is_response else plan.failed, message)
-        return not isinstance(self._since(before, plan.label), str)
+        before, topic = len(self.events), plan.label if is_response else plan.failed
+        self.ros(topic, message)
+        sent = self._since(before, plan.label)
+        self.events[before:] = [_of_route(topic, event) for event in self.events[before:]]
+        return not isinstance(sent, str)
 
     def finished(self, plan: CalledPlan, outcome: str, duration: int) -> None:
         if outcome != ANSWERED:
             self.events.append(Unanswered(self.now, plan.label, outcome))
+
+
+def _of_route(route: str, event: Event) -> Event:
+    """Return the event of a reply as of this route: what `on_timeout` says is no response."""
+    return replace(event, route=route) if isinstance(event, (Sent, Dropped)) else event

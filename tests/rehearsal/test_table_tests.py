@@ -628,6 +628,15 @@ def test_what_happens_between_steps_includes_the_end_of_calls(tmp_path: Path) ->
     assert said_of_services(tmp_path, *steps) == [(message, "on_timeout")]
 
 
+def test_what_on_timeout_fills_is_shown_in_place_of_the_reply(tmp_path: Path) -> None:
+    asked = "{given: {case: home_request, from: arm_board, fields: {id: 7}}, expect: {called: {ask_home: any}}}"
+    late = "{at: 1s, expect: {sent: {arm_board: {home_reply: {id: 8}}}}}"
+    (result,) = run_tests(of_services(tmp_path, asked, late))
+    (failure,) = result.failures
+    assert failure.table is not None
+    assert "on_timeout" in Path(failure.table.span.file).read_text().splitlines()[failure.table.span.line - 1]
+
+
 def test_what_happened_says_how_calls_ended(tmp_path: Path) -> None:
     (result,) = run_tests(of_services(tmp_path, f"{{given: {CALLED}, until: 1s, expect: nothing}}"))
     (step,) = result.failed
@@ -788,7 +797,7 @@ def test_a_service_needs_a_call_a_reply_and_one_without(tmp_path: Path) -> None:
     assert missing("arm", call, reply) == [stale, timed_out]
     assert missing("arm", call, *late) == [no_reply, stale]
     assert missing("ask_home", asked, response) == ["no test has a call of ask_home that times out"]
-    assert missing("ask_home", asked, unanswered) == ["no test has a response of ask_home"]
+    assert missing("ask_home", asked, unanswered) == ["no test checks what service.ask_home delivers to arm_board"]
 
 
 def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
