@@ -15,6 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from router.compiler.compiled_table import ANSWERED, MOST_CALLS, ServicePlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import UNSENT_REASONS
+from router.types.framing import restored
 from router.types.protobuf import Envelope
 from router.types.table_envelopes import Envelopes
 
@@ -175,7 +176,7 @@ class Calls(Generic[Caller]):
 
 def number_in(envelope: Envelope, datagram: bytes, match: tuple[str, ...]) -> int:
     """Return the value of the field `match` in a datagram that the router has sent, as an integer of 64 bits."""
-    outer = envelope.message_class.FromString(datagram)
+    outer = envelope.message_class.FromString(restored(datagram))
     path = match[1:] if match[0] == ENVELOPE else match
     value: Any = outer if match[0] == ENVELOPE else envelope.payloads_of(outer)[-1][1]
     for name in path:

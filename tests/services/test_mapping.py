@@ -137,3 +137,9 @@ def test_the_number_of_a_datagram(program: CompiledTable, number: int) -> None:
     datagram = program.envelopes.first.message_class(req_id=number, arm_request={"id": 5}).SerializeToString()
     assert number_in(program.envelopes.first, datagram, ("envelope", "req_id")) == number
     assert number_in(program.envelopes.first, datagram, ("id",)) == 5
+
+
+def test_the_number_of_a_datagram_without_its_trailing_zeros(program: CompiledTable) -> None:
+    datagram = program.envelopes.first.message_class(req_id=7, drive={}).SerializeToString()
+    assert datagram[-1] == 0
+    assert number_in(program.envelopes.first, datagram[:-1], ("envelope", "req_id")) == 7
