@@ -143,6 +143,7 @@ def _several_machines(table: RouteTable) -> Iterator[Diagnostic]:
 def _learned_findings(table: RouteTable) -> Iterator[Diagnostic]:
     """Yield findings for endpoints whose address is learned."""
     sources = {source.value for route in table.routes for source in route.sources}
+    sources |= {called.source.source.value for called in table.called.values()}
     for endpoint in table.endpoints.values():
         address = endpoint.address
         if not address.value.is_learned:
