@@ -7,7 +7,6 @@ reply. Every service that an endpoint calls has a server.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 from router.compiler.compiled_table import ANSWERED, CalledPlan, CompiledTable, ServicePlan
@@ -88,13 +87,12 @@ class Stage(Rehearsal):
 
     def _since(self, before: int, label: str) -> bytes | str:
         """Return the datagram that the route of a service has sent since then, or why it has not."""
-        happened: Sequence[Event] = self.events[before:]
-        for event in happened:
+        for event in self.events[before:]:
             if isinstance(event, Sent) and event.route == label:
                 return event.data
             if isinstance(event, Dropped) and event.route == label:
                 return event.reason
-        raise AssertionError(happened)
+        raise AssertionError(label)
 
     def _publish(self, label: str, message: bytes) -> None:
         route = self._pairing.route if self._pairing is not None else label

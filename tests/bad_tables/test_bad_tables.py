@@ -124,9 +124,13 @@ def test_what_to_write_in_its_place_has_nothing_wrong(
     assert main(["validate", "--strict", str(table)]) == OK, capsys.readouterr().out
 
 
-def test_what_the_bad_tables_extend_has_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["validate", "--strict", str(HERE / "base" / "base.yaml")]) == OK
-    assert "base.yaml: ok (" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("name", "has"),
+    [("base", "3 payload cases, 1 topic, 2 endpoints"), ("calls", "2 payload cases, 2 services, 2 endpoints")],
+)
+def test_what_the_bad_tables_extend_has_nothing_wrong(name: str, has: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "--strict", str(HERE / "base" / f"{name}.yaml")]) == OK
+    assert f"{name}.yaml: ok ({has})" in capsys.readouterr().out
 
 
 def test_every_code_has_a_page_with_its_meaning_and_an_error() -> None:
