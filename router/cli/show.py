@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.margin is not None and args.around is None:
         raise UsageError("--margin is for --around", "give both")
     with closing(Recording(args.file)) as recording:
-        wire = Wire(recorded_envelopes(recording.cases(), recording.about))
+        wire = Wire(recorded_envelopes(recording.types(), recording.about))
         entries = in_order(recording.everything())
         first = next(entries, None)
         if first is None:

@@ -8,6 +8,7 @@ router sent, and its other actions.
 from __future__ import annotations
 
 import enum
+from functools import lru_cache
 
 from google.protobuf.descriptor import Descriptor, FileDescriptor
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
@@ -44,11 +45,11 @@ class Holds(enum.Enum):
     DATAGRAM = "datagram"
     """All other datagrams, byte for byte."""
     VIEW = "view"
-    """Payloads of datagrams that are also recorded raw: for viewers, not for replay."""
+    """Payloads of datagrams that are also recorded whole: for viewers, not for replay."""
     SENT = "sent"
     """Payloads that the router sent; not for replay."""
     EVENT = "event"
-    """Actions without a payload, as `Event`; not for replay."""
+    """All other actions, as `Event`; not for replay."""
 
 
 class Channels:
@@ -72,17 +73,24 @@ class Channels:
         topic, metadata = _decided(case.name, _metadata(case, Holds.VIEW), reason)
         return self._channel(topic, _payload(case), metadata)
 
-    def datagrams(self, reason: str) -> int:
-        topic, metadata = _decided(DATAGRAMS, {"holds": Holds.DATAGRAM.value}, reason)
-        return self._channel(topic, DATAGRAM, metadata)
+    def datagrams(self, message: Descriptor, label: str, reason: str) -> int:
+        """Return the channel of whole datagrams. `label`: the name of their envelope, if `message` is for that only."""
+        topic, metadata = _decided(_raw(label), _whole(Holds.DATAGRAM, label), reason)
+        return self._channel(topic, message, metadata)
 
-    def sent(self, case: PayloadCase, what: str, route: str, target: str, ros_topic: str) -> int:
-        """Return the channel of payloads that were sent. The arguments are those of an Action."""
-        metadata = {**_metadata(case, Holds.SENT), "what": what, "route": route, "endpoint": target, "ros": ros_topic}
+    def sent(
+        self, case: PayloadCase, what: str, route: str, target: str, ros_topic: str, holds: Holds = Holds.SENT
+    ) -> int:
+        """Return the channel of payloads that were sent. The texts are those of an Action."""
+        metadata = {**_metadata(case, holds), "what": what, "route": route, "endpoint": target, "ros": ros_topic}
         return self._channel(SENT.format(topic=case.name), _payload(case), metadata)
 
+    def sent_datagrams(self, message: Descriptor, label: str) -> int:
+        """Return the channel of whole datagrams that were sent, each as an Event."""
+        return self._channel(SENT.format(topic=_raw(label)), message, _whole(Holds.EVENT, label))
+
     def events(self) -> int:
-        return self._channel(EVENTS, EVENT, {"holds": Holds.EVENT.value})
+        return self._channel(EVENTS, EVENT, _whole(Holds.EVENT, ""))
 
     def _channel(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> int:
         key = self._key(topic, message, metadata)
@@ -112,6 +120,15 @@ def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
     return {"holds": holds.value, "number": str(around.tag >> 3), **named, **shared, **of}
 
 
+def _raw(label: str) -> str:
+    """Return the topic of whole datagrams, which is one for each schema."""
+    return f"{DATAGRAMS}/{label}" if label else DATAGRAMS
+
+
+def _whole(holds: Holds, label: str) -> dict[str, str]:
+    return {"holds": holds.value, **({"envelope": label} if label else {})}
+
+
 def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:
     """Return topic and metadata, changed for rejected datagrams if there is a `reason`."""
     if not reason:
@@ -123,16 +140,18 @@ def _payload(case: PayloadCase) -> Descriptor:
     return case.message_class.DESCRIPTOR  # type: ignore[return-value]  # or upb's, which is the same
 
 
+@lru_cache(256)
 def descriptor_set(message: Descriptor) -> bytes:
     """Return a serialized FileDescriptorSet: the file of a message, preceded by its imports."""
     files: dict[str, bytes] = {}
-    _collect(message.file, files)
+    collect(message.file, files)
     return FileDescriptorSet(file=[FileDescriptorProto.FromString(data) for data in files.values()]).SerializeToString()
 
 
-def _collect(file: FileDescriptor, into: dict[str, bytes]) -> None:
+def collect(file: FileDescriptor, into: dict[str, bytes]) -> None:
+    """Add a file, preceded by its imports, by name."""
     for imported in file.dependencies:
-        _collect(imported, into)
+        collect(imported, into)
     into.setdefault(file.name, file.serialized_pb)
 
 
@@ -151,7 +170,10 @@ _TEXT, _BYTES = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTE
 
 DATAGRAM = _own_message("Datagram", listener=_TEXT, peer=_TEXT, data=_BYTES, endpoint=_TEXT)
 Datagram = GetMessageClass(DATAGRAM)
-"""`peer` is HOST:PORT, `data` the bytes as received, `endpoint` the sender's name in the table."""
+"""`peer` is HOST:PORT, `data` the bytes as received, `endpoint` the sender's name in the table.
+
+Like an Event, it may have a field `envelope` (see `Whole`).
+"""
 
 EVENT = _own_message(
     "Event", what=_TEXT, route=_TEXT, endpoint=_TEXT, ros=_TEXT, reason=_TEXT, detail=_TEXT, data=_BYTES

@@ -11,9 +11,10 @@ from google.protobuf.message import DecodeError as ProtobufError
 
 from router.datagrams import Peer
 from router.declared import MAX_DATAGRAM
-from router.recording.channels import Channels, Datagram, Event
-from router.recording.mirror import Acted, Action, Classifier, Format, Mirrored, Taken
-from router.types.protobuf import PayloadCase
+from router.recording.beside import Whole
+from router.recording.channels import Channels, Event, Holds
+from router.recording.mirror import BRAKED, SENT, Acted, Action, Classifier, Format, Mirrored, Taken
+from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import varint
 
 T = TypeVar("T")
@@ -130,14 +131,16 @@ class Encoder:
         self._steady = 0
         self._classifier: Classifier | None = None
         self._shapes: dict[tuple[str, Peer, str, str, int, bytes], _Shape] = {}
+        self._wholes: dict[Envelope, Whole] = {}
 
     def messages(self, batch: Batch) -> Iterator[Message]:
         """Yield the payload of a datagram if it is the whole datagram; else the datagram, and its payload if there is
-        one. Yield the payload of an action if there is one, else an Event.
+        one. Likewise, yield the payload of an action, or else an Event.
         """
         if batch.classifier is not self._classifier:
             self._classifier = batch.classifier
             self._shapes.clear()
+            self._wholes.clear()
         for at, listener, peer, endpoint, reason, data in batch.datagrams:
             self.datagrams += 1
             self.bytes += len(data)
@@ -157,8 +160,8 @@ class Encoder:
             for channel, message in self._raw(batch.classifier, listener, peer, endpoint, reason, data):
                 yield Message(channel, at, message, steady, sequence)
         for action in map(Action._make, batch.actions):
-            channel, message = self._action(batch.classifier, action)
-            yield Message(channel, action.at, message, max(0, action.at + batch.shift), 0)
+            for channel, message in self._action(batch.classifier, action):
+                yield Message(channel, action.at, message, max(0, action.at + batch.shift), 0)
 
     def _shape(self, classifier: Classifier, key: tuple[str, Peer, str, str, int, bytes], data: bytes) -> _Shape:
         if len(self._shapes) >= _MOST_SHAPES:
@@ -176,25 +179,41 @@ class Encoder:
         self, classifier: Classifier, listener: str, peer: Peer, endpoint: str, reason: str, data: bytes
     ) -> Iterator[tuple[int, bytes]]:
         """Yield channel and message of a datagram, and of its payloads."""
-        datagram = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=endpoint)
-        yield self._channels.datagrams(reason), datagram.SerializeToString()
-        for case, payload in classifier.encoded_payloads(listener, data):
+        payloads = classifier.encoded_payloads(listener, data)
+        whole = self._whole(classifier.at(listener).envelope)
+        texts = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
+        datagram = whole.datagram(data if payloads else b"", data=data, **texts)
+        yield self._channels.datagrams(whole.datagram_type, whole.label, reason), datagram
+        for case, payload in payloads:
             yield self._channels.view(case, reason), payload
 
-    def _action(self, classifier: Classifier, action: Action) -> tuple[int, bytes]:
-        """Return channel and message: the payload that was sent, or else an Event."""
+    def _whole(self, envelope: Envelope) -> Whole:
+        if envelope not in self._wholes:
+            self._wholes[envelope] = Whole(envelope)
+        return self._wholes[envelope]
+
+    def _action(self, classifier: Classifier, action: Action) -> Iterator[tuple[int, bytes]]:
+        """Yield channel and message: the payload that was sent, an Event, or both if other fields are beside it."""
         _, what, route, target, topic, reason, detail, data = action
-        if data and not reason and (sent := classifier.sent_payload(target, data)) is not None:
-            case, payload = sent
-            return self._channels.sent(case, what, route, target, topic), payload
-        event = Event(what=what, route=route, endpoint=target, ros=topic, reason=reason, detail=detail, data=data)
-        return self._channels.events(), event.SerializeToString()
+        is_sent = what in (SENT, BRAKED) and not reason
+        texts = {"what": what, "route": route, "endpoint": target, "ros": topic, "reason": reason, "detail": detail}
+        if not is_sent or (sent := classifier.sent_payload(target, data)) is None:
+            yield self._channels.events(), Event(data=data, **texts).SerializeToString()
+            return
+        case, payload = sent
+        whole = self._whole(classifier.to(target).envelope)
+        if whole.has_beside:
+            yield self._channels.sent_datagrams(whole.event_type, whole.label), whole.event(data, data=data, **texts)
+        holds = Holds.VIEW if whole.has_beside else Holds.SENT
+        yield self._channels.sent(case, what, route, target, topic, holds), payload
 
 
 def _only_payload(of: Format, data: bytes, length: int) -> tuple[PayloadCase, bytes] | None:
-    """Return the payload case of a datagram that has only a payload, and what precedes it; else None."""
+    """Return the payload case of a datagram that can have only a payload, and what precedes it; else None."""
     if of.frame_case is not None:
         return of.frame_case, b""
+    if of.envelope.beside.fields:
+        return None
     tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
     case, header = of.cases_by_tag.get(tag), _header(tag, length)
     return (case, header) if case is not None and header is not None else None

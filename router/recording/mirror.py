@@ -313,6 +313,10 @@ class Classifier:
         """Return the format of what a listener receives."""
         return self._formats[self._envelopes.at(listener)]
 
+    def to(self, endpoint: str) -> Format:
+        """Return the format of what an endpoint gets."""
+        return self._formats[self._envelopes.to(endpoint)]
+
     def payloads(self, listener: str, data: bytes) -> list[tuple[PayloadCase, Message]]:
         """Return the payloads with their cases; none for a datagram that the listener rejects."""
         envelope = self._envelopes.at(listener)
@@ -333,9 +337,10 @@ class Classifier:
 
     def sent_payload(self, endpoint: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
         """Return case and payload of a datagram that the router has sent there, perhaps without trailing zeros."""
-        envelope = self._envelopes.to(endpoint)
-        if (field := self._formats[envelope].single_field(data)) is not None:
+        of = self.to(endpoint)
+        if (field := of.single_field(data)) is not None:
             return field
+        envelope = of.envelope
         try:
             payloads = envelope.payloads_of(envelope.message_class.FromString(restored(data)))
         except ProtobufError:

@@ -21,9 +21,10 @@ from mcap.stream_reader import StreamReader
 
 from router.datagrams import Peer
 from router.errors import UsageError, did_you_mean_file
+from router.recording.beside import beside_in
 from router.recording.channels import Datagram, Event, Holds
 from router.recording.mirror import Action
-from router.recording.schemas import RecordedCase, wrapping_of
+from router.recording.schemas import RecordedCase, RecordedTypes, wrapping_of
 from router.recording.writer import METADATA
 from router.types.case_by import Wrapping
 from router.types.wire import varint
@@ -31,6 +32,7 @@ from router.types.wire import varint
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
 """Errors in files that no recorder wrote; lz4, which `mcap recover` may have used, raises RuntimeError."""
 _OURS = frozenset(held.value for held in Holds)
+_WHOLE = (Holds.DATAGRAM.value, Holds.EVENT.value)
 
 
 class Recorded(NamedTuple):
@@ -128,31 +130,34 @@ class Recording:
             pass
         self.ends_early = not self.is_whole
 
-    def cases(self) -> list[RecordedCase]:
-        """Return the payload cases of all channels. Chunks are skipped if there is an index. Call this before reading
+    def types(self) -> RecordedTypes:
+        """Return what all channels declare. Chunks are skipped if there is an index. Call this before reading
         messages.
         """
-        return self._cases(emit_chunks=True) or self._cases(emit_chunks=False)
+        found = self._types(emit_chunks=True)
+        return found if found.cases or found.beside else self._types(emit_chunks=False)
 
-    def _cases(self, *, emit_chunks: bool) -> list[RecordedCase]:
-        """Return the payload cases of the channels outside chunks, or of all channels."""
+    def _types(self, *, emit_chunks: bool) -> RecordedTypes:
+        """Return what the channels outside chunks declare, or all channels."""
         with self.path.open("rb") as file:
             schemas: dict[int, Schema] = {}
             cases: dict[tuple[str, Wrapping], RecordedCase] = {}
+            beside: dict[str, bytes] = {}
             try:
                 for record in StreamReader(file, emit_chunks=emit_chunks, record_size_limit=self.size).records:
                     if isinstance(record, Schema):
                         schemas[record.id] = record
-                    elif isinstance(record, Channel) and "number" in record.metadata:
-                        case, schema = record.topic.rpartition("/")[2], schemas[record.schema_id]
-                        around = wrapping_of(record.metadata)
-                        cases.setdefault(
-                            (case, around),
-                            RecordedCase(case, around, schema.name, schema.data, record.metadata.get("envelope", "")),
-                        )
+                    elif isinstance(record, Channel):
+                        schema, label = schemas[record.schema_id], record.metadata.get("envelope", "")
+                        if "number" in record.metadata:
+                            case, around = record.topic.rpartition("/")[2], wrapping_of(record.metadata)
+                            made = RecordedCase(case, around, schema.name, schema.data, label)
+                            cases.setdefault((case, around), made)
+                        elif record.metadata.get("holds") in _WHOLE and beside_in(schema.data) is not None:
+                            beside.setdefault(label, schema.data)
             except _DAMAGED:
                 pass
-        return [*cases.values()]
+        return RecordedTypes([*cases.values()], beside)
 
     def _take(self, record: McapRecord) -> None:
         if isinstance(record, Channel):

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
-from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+    OneofDescriptorProto,
+)
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
 from router.declared import ONLY_CASE
 from router.recording.about import envelopes_of
+from router.recording.beside import beside_in, take_syntax
 from router.types.case_by import ByCases, ByFrame, ByName, ByOneof, Choice, Wrapping
+from router.types.model import MessageType
 from router.types.nanopb import NO_OPTIONS
 from router.types.protobuf import Envelope, PayloadCase, build_types, no_protos
 from router.types.table_envelopes import Envelopes
 from router.types.wire import LEN, read_varint
 
-_FILE, _NAME, _ONEOF = "rover_router/recorded.proto", "rover_router.Recorded", "payload"
-_NAME_FIELD, _DATA_FIELD = "name", "data"
+_FILE, _NAME = "rover_router/recorded.proto", "rover_router.Recorded"
+_ONEOF, _NAME_FIELD, _DATA_FIELD = "rover_router_payload", "rover_router_name", "rover_router_data"
+"""No field beside the payload has such a name."""
 _TEXT, _BYTES = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTES
 _OPTIONAL = FieldDescriptorProto.LABEL_OPTIONAL
 
@@ -37,6 +47,15 @@ class RecordedCase(NamedTuple):
     envelope: str = ""
 
 
+class RecordedTypes(NamedTuple):
+    """What the channels of a recording declare: payload cases, and by envelope the schemas of its whole datagrams, if
+    these have fields beside the payload.
+    """
+
+    cases: Sequence[RecordedCase]
+    beside: Mapping[str, bytes]
+
+
 def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
     """Return how an envelope holds the payloads of a channel, from its metadata."""
     number = int(metadata["number"])
@@ -44,24 +63,28 @@ def wrapping_of(metadata: Mapping[str, str]) -> Wrapping:
     return Wrapping(number << 3 | LEN if number else 0, before, after, is_shared="shared" in metadata)
 
 
-def recorded_envelopes(cases: Iterable[RecordedCase], about: Mapping[str, str]) -> Envelopes:
-    """Return the envelopes of a recording, from its payload cases and its metadata."""
+def recorded_envelopes(types: RecordedTypes, about: Mapping[str, str]) -> Envelopes:
+    """Return the envelopes of a recording, from its types and its metadata."""
     names = envelopes_of(about)
     of_envelope: dict[str, list[RecordedCase]] = {name: [] for known in names for name in known.values()}
-    for case in cases:
+    for case in types.cases:
         of_envelope.setdefault(case.envelope, []).append(case)
-    by_name = {name: recorded_envelope(several) for name, several in of_envelope.items()}
+    by_name = {name: recorded_envelope(several, types.beside.get(name)) for name, several in of_envelope.items()}
     return Envelopes(by_name or {"": recorded_envelope(())}, *names)
 
 
-def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
-    """Return an envelope with these cases. If the protos changed during the recording, the first ones are used."""
+def recorded_envelope(cases: Iterable[RecordedCase], beside: bytes | None = None) -> Envelope:
+    """Return an envelope with these cases, and with the fields `beside` the payload (see `RecordedTypes`).
+
+    If the protos changed during the recording, the first ones are used.
+    """
     known = {(case.around.tag, case.around.before, case.around.after): case for case in sorted(cases, reverse=True)}
     pool, files = DescriptorPool(), dict[str, FileDescriptorProto]()
-    for case in known.values():
-        for file in FileDescriptorSet.FromString(case.schema).file:
-            if files.setdefault(file.name, file) is file:
-                pool.AddSerializedFile(file.SerializeToString())
+    around = beside_in(beside) if beside is not None else None
+    sets = [FileDescriptorSet.FromString(case.schema).file for case in known.values()]
+    for file in chain(*sets, around.imports if around is not None else ()):
+        if files.setdefault(file.name, file) is file:
+            pool.AddSerializedFile(file.SerializeToString())
     types, _ = build_types(pool, [*files], {}, lambda _: NO_OPTIONS)
 
     def made(case: RecordedCase, number: int) -> PayloadCase:
@@ -70,7 +93,12 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
         return PayloadCase(case.name, number, kind, message_class, None, case.around, case.envelope)
 
     own = FileDescriptorProto(name=_FILE, package="rover_router", syntax="proto3", dependency=[*files])
-    message = own.message_type.add(name="Recorded")
+    message = own.message_type.add()
+    if around is not None:
+        take_syntax(own, around.file)
+        message.CopyFrom(around.message)
+    message.name = "Recorded"
+    names = {field.name for field in message.field}
     inside = sorted((case for case in known.values() if case.around.is_alone), key=lambda case: case.around.tag)
     named = [case for case in known.values() if case.around.tag and not case.around.is_alone]
     choice: Choice
@@ -91,13 +119,18 @@ def recorded_envelope(cases: Iterable[RecordedCase]) -> Envelope:
     by_name = {case.name: case for case in payload_cases}
     message_class = GetMessageClass(pool.FindMessageTypeByName(_NAME))
     label = next((case.envelope for case in payload_cases), "")
-    return Envelope(_NAME, no_protos(), choice, message_class, by_name, 0, label=label)
+    kinds, _ = build_types(pool, [*files, _FILE], {}, lambda _: NO_OPTIONS)
+    members = MessageType(_NAME, tuple(field for field in kinds[_NAME].fields if field.name in names))
+    return Envelope(_NAME, no_protos(), choice, message_class, by_name, 0, beside=members, label=label)
 
 
 def _add_fields(message: DescriptorProto, cases: Sequence[PayloadCase], *, is_shared: bool) -> Choice:
     """Add a field for each case: to a oneof, unless a frame may hold several."""
     if cases and not is_shared:  # protobuf refuses an empty oneof
-        message.oneof_decl.add(name=_ONEOF)
+        for field in message.field:
+            if field.HasField("oneof_index"):
+                field.oneof_index += 1  # a oneof that stands for `optional` must be behind all others
+        message.oneof_decl.insert(0, OneofDescriptorProto(name=_ONEOF))
     for each in cases:
         message.field.add(
             name=each.member,

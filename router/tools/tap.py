@@ -341,7 +341,7 @@ def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> Sequence[Tapp
         peer, envelope = it.endpoint or f"{it.peer[0]}:{it.peer[1]}", wire.envelopes.at(it.listener)
         return tapped_datagram(it.at, peer, it.data, wire, it.reason, envelope)
     try:
-        decoded = wire.decode(it.data, wire.envelopes.to(it.target)) if it.what in (SENT, BRAKED) and it.data else None
+        decoded = wire.decode(it.data, wire.envelopes.to(it.target)) if it.what in (SENT, BRAKED) else None
     except DecodeError:
         decoded = None
     return [ShownAction(local_time(it.at), it, decoded)]

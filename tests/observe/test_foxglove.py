@@ -25,6 +25,7 @@ from websockets.uri import parse_uri
 
 from router.compiler import check_table
 from router.compiler.compiled_table import CompiledTable
+from router.datagrams import Wire
 from router.errors import Located, SourceSpan, StartError
 from router.net import doors
 from router.net.doors import Door
@@ -37,6 +38,7 @@ from router.table.model.settings import ServerSettings
 from tests.observe.foxglove_client import PATIENCE, SUBPROTOCOL, FoxgloveClient
 from tests.tables import PROTOS, ROUTES
 
+TABLES = Path(__file__).parents[1] / "rehearsal" / "tables"
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
 LOOPBACK = Address("127.0.0.1", 0)
 PEER = ("192.168.0.30", 8)
@@ -158,6 +160,31 @@ def test_every_schema_is_whole_and_only_what_was_subscribed_to_is_sent(
     for case in program.envelopes.first.cases:
         router.show(envelope(program, "imu_info"), envelope(program, case))
         assert case == "imu_info" or client.receive().topic == case
+
+
+KINDS = [
+    ("framed", {"rover": [b"\x08\x02\x10\x02", b""]}),
+    ("named", {"rover": [b"\x0a\x06Status\x12\x02\x08\x05", b"\x12\x02\x08\x01\x18\x01\x0a\x0bburt.Status"]}),
+    ("vision", {"rover": [b"\x12\x02\x08\x05", b"\x3a\x02\x08\x09\x18\x03\x12\x04\x08\x05\x12\x00"]}),
+    ("several", {"game": [b"\x08\x02\x10\x02", b""], "crowd": [b"\x08\x07\x12\x00", b"\x1a\x05\x0d\0\0\x80\x3f"]}),
+]
+
+
+@pytest.mark.parametrize(("table", "received"), KINDS)
+def test_schemas_decode_the_payloads_of_each_kind_of_envelope(table: str, received: dict[str, list[bytes]]) -> None:
+    made = compiled(TABLES / f"{table}.yaml")
+    router = Showing(made)
+    shown = [(at, data) for at, listed in received.items() for data in listed]
+    expected = [each for at, data in shown for each in Wire(made.envelopes).decode_all(data, made.envelopes.at(at))]
+    with closing(serve(router)) as server, FoxgloveClient(server.address.port) as client:
+        assert client.channels.keys() == made.envelopes.cases.keys()
+        client.subscribe(*made.envelopes.cases)
+        router.wait_for(1)
+        for at, data in shown:
+            router.show(data, listener=at)
+        for each in expected:
+            told = client.receive()
+            assert (told.topic, told.message.SerializeToString()) == (each.case.name, each.message.SerializeToString())
 
 
 def test_router_is_watched_only_while_somebody_has_subscribed(router: Showing, server: FoxgloveServer) -> None:
