@@ -45,7 +45,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--why", action="store_true", help="explain each stop instead")
     about = "only payloads of this case, received or sent; may be repeated"
     parser.add_argument("--case", dest="cases", action="append", default=[], metavar="CASE", help=about)
-    about = "only payloads for which this expression is true: 'satellites < 4'"
+    about = "only payloads for which this expression is true: 'satellites < 4', 'envelope.seq > 9'"
     parser.add_argument("--where", metavar="EXPR", help=about)
     about = "only around this time: local, such as 14:03 or 14:03:07, or with date, such as 2026-04-12T14:03"
     parser.add_argument("--around", metavar="TIME", help=about)
