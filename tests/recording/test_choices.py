@@ -169,6 +169,29 @@ def test_fields_beside_the_payload_are_shown(tmp_path: Path, capsys: pytest.Capt
     assert len(printed(path, capsys, "--where", "not has(envelope.volts)")) == 4
 
 
+def test_each_envelope_has_its_own_fields_beside_the_payload(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = program("several.yaml")
+    crowd, tick = made.envelopes.by_name["crowd"].message_class, made.envelopes.by_name["show"].message_class
+    noise, light = crowd(seq=7, status={"noise": 1.0}).SerializeToString(), tick(tick=3, light={}).SerializeToString()
+    batch = [shown(noise, START, listener="crowd"), shown(b"", START + 1, listener="game")]
+    acted = [Action(START + 2, SENT, "crowd.light", "stage", data=light)]
+    packed = Packer().pack(Listed(batch), Listed(acted), Classifier(made.envelopes, made.table), START, 0)
+    path = write(tmp_path / "it.mcap", Channels(), packed, metadata=about(made.table, "test"))
+    assert printed(path, capsys) == [
+        "sensor_board crowd.status noise=1 envelope.seq=7",
+        "sensor_board game.status (all default)",
+        "sent to stage (crowd.light): show.light envelope.tick=3",
+    ]
+    assert len(printed(path, capsys, "--where", "envelope.tick == 3")) == 1
+    with path.open("rb") as file:
+        topics = sorted(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert topics == [
+        "crowd.status", "game.status", "raw/datagrams/crowd", "sent/raw/datagrams/show", "sent/show.light",
+    ]  # fmt: skip
+
+
 def test_an_empty_message_that_is_the_whole_frame_is_recorded_as_a_payload(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -228,11 +251,12 @@ option features.field_presence = IMPLICIT;
 enum Mode { option features.enum_type = CLOSED; OFF = 0; ON = 5; }
 message Note { float x = 1; }
 message Frame {
-  uint32 seq = 1 [features.field_presence = EXPLICIT]; oneof payload { Note note = 2; } Mode mode = 4 [features.field_presence = EXPLICIT];
+  uint32 seq = 1 [features.field_presence = EXPLICIT]; oneof payload { Note note = 2; }
+  Mode mode = 4 [features.field_presence = EXPLICIT];
   Note part = 6 [features.message_encoding = DELIMITED];
 }
 """
-NAMED = """syntax = "proto3";
+NAME_CLASHES = """syntax = "proto3";
 message Note { float x = 1; }
 message Frame { string kind = 1; bytes body = 2; string name = 3; bytes data = 4; Note payload = 5; }
 """
@@ -245,7 +269,7 @@ SYNTAXES = [
         "seq: 0 note {} b: '' inner {mode: ON} modes: [ON] counts {key: 'a' value: 3} is_last: false",
     ),
     (EDITION, "oneof: payload", "seq: 0 note {} mode: ON part {x: 2}"),
-    (NAMED, "case: kind, payload: body", "kind: 'Note' name: 'n' data: 'd' payload {x: 3}"),
+    (NAME_CLASHES, "case: kind, payload: body", "kind: 'Note' name: 'n' data: 'd' payload {x: 3}"),
 ]
 
 
