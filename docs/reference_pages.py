@@ -62,8 +62,9 @@ TABLE = (
     Section("Transport", "gateways.NAME.transport", "definitions.transport"),
     Section("Zenoh", "gateways.NAME.transport.zenoh", "definitions.zenoh"),
     Section("Patterns of topics", "gateways.NAME.topics.include", "definitions.topic_pattern.then"),
-    Section("Inbound topics", "gateways.NAME.inbound", "definitions.inbound"),
+    Section("Inbound topics", "gateways.NAME.inbound", "definitions.inbound_topic"),
     Section("Deadman of an inbound topic", "gateways.NAME.inbound.deadman", "definitions.inbound_deadman"),
+    Section("Inbound services", "gateways.NAME.inbound", "definitions.inbound_service"),
 )
 TEST = (
     Section("Tests", "tests.NAME", "definitions.test"),
@@ -207,6 +208,8 @@ class SchemaPage:
                 return f"{short}[{heading if heading == 'Zenoh' else heading.lower()}](#{slug(heading)})"
         if name == "source":
             return "endpoint, `any`, or [source topic](#source-topics)"
+        if name == "inbound":
+            return "[inbound topics](#inbound-topics) and [inbound services](#inbound-services)"
         if name == "case":
             return "[route](#routes), or a list"
         return self._kind(self.schema["definitions"][name])

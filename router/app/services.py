@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from router.app.change import Change
 from router.clock import boottime_ns, wall_ns
-from router.compiler.compiled_table import ANSWERED, CalledPlan, ServicePlan
+from router.compiler.compiled_table import ANSWERED, CalledPlan, ClientCallPlan, ServicePlan
 from router.compiler.metrics import CALL_BOUNDS_NS, CALL_OUTCOMES, HISTOGRAM_CELLS, Report
 from router.log import fault, logger
 from router.services.asking import Asking
@@ -297,10 +297,10 @@ class Services:
         self._sender.close()
 
 
-def _is_other(kept: ServicePlan | CalledPlan, plan: ServicePlan | CalledPlan) -> bool:
+def _is_other(kept: ServicePlan | CalledPlan | ClientCallPlan, plan: ServicePlan | CalledPlan) -> bool:
     """Return whether ROS needs another service or client."""
 
-    def key(each: ServicePlan | CalledPlan) -> tuple[object, ...]:
+    def key(each: ServicePlan | CalledPlan | ClientCallPlan) -> tuple[object, ...]:
         name = each.ros_name if isinstance(each, ServicePlan) else each.service
         return name, each.type_name, each.definitions
 

@@ -64,13 +64,14 @@ def _type_clashes(lookup: Lookup) -> Iterator[Diagnostic]:
     """Yield a finding for each service that is called with another type than elsewhere in the table."""
     table = lookup.table
     types = {resolved(each.name, table.node): each.type for each in table.services.values()}
-    for declared in table.called.values():
-        called = declared.call
-        other = types.setdefault(resolved(called.service.value, table.node), called.type)
-        if other.value != called.type.value:
-            message = f"'{called.service.value}' has the type {called.type.value} here, but {other.value} elsewhere"
+    called = [(each.call.service.value, each.call.type) for each in table.called.values()]
+    called += [(each.service.value, each.type) for gateway in table.gateways.values() for each in gateway.calls]
+    for service, type_ in called:
+        other = types.setdefault(resolved(service, table.node), type_)
+        if other.value != type_.value:
+            message = f"'{service}' has the type {type_.value} here, but {other.value} elsewhere"
             hint = f"a service has one type in ROS: see {other.span}"
-            yield Diagnostic(called.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
+            yield Diagnostic(type_.span, Code.TOPIC_TYPE_CLASH, message, hint)
 
 
 # values that are kept

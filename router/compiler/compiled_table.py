@@ -15,7 +15,7 @@ from router.errors import SourceSpan
 from router.table.addresses import LinkPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
-from router.table.model.gateways import Gateway, Inbound
+from router.table.model.gateways import Gateway, Inbound, InboundService
 from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
@@ -311,11 +311,41 @@ class InboundPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ClientCallPlan:
+    """A ROS service that a gateway's clients may call; `label` is its absolute name, which clients use.
+
+    `request` and `response` are the types of its two messages, `definitions` as in TopicPlan. Calls are counted under
+    `name`, which has the gateway's name.
+    """
+
+    settings: InboundService
+    name: str
+    label: str
+    request: MessageType
+    response: MessageType
+    definitions: Mapping[str, tuple[tuple[str, str], ...]]
+
+    @property
+    def service(self) -> str:
+        """The name of the service as the table writes it, which ROS resolves and remaps."""
+        return self.settings.service.value
+
+    @property
+    def type_name(self) -> str:
+        return self.settings.type.value
+
+    @property
+    def span(self) -> SourceSpan:
+        return self.settings.span
+
+
+@dataclass(frozen=True, slots=True)
 class GatewayPlan:
-    """A gateway, with the topics that its clients may publish on, by absolute name."""
+    """A gateway, with the topics that its clients may publish on, by absolute name, and likewise the services."""
 
     settings: Gateway
     inbound: Mapping[str, InboundPlan]
+    calls: Mapping[str, ClientCallPlan]
 
 
 @dataclass(frozen=True, slots=True)

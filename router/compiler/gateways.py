@@ -7,15 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from router.compiler.compiled_table import DeadmanPlan, GatewayPlan, InboundPlan
+from router.compiler.compiled_table import ClientCallPlan, DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.constants import cdr_of
 from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
-from router.compiler.lookup import Lookup
+from router.compiler.lookup import Lookup, definitions_of
 from router.compiler.selection import pattern_problem
+from router.compiler.services import service_type
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, FindingError
 from router.table.model import RouteTable
-from router.table.model.gateways import Gateway, Inbound
+from router.table.model.gateways import Gateway, GatewayFormat, Inbound, InboundService, Transport
 from router.types.model import MessageType
 
 
@@ -32,7 +33,7 @@ def check_gateways(lookup: Lookup) -> tuple[GatewayPlan, ...]:
             from router.compiler.zenoh_config import scouting_findings
 
             lookup.findings += scouting_findings(gateway, lookup.table.networks)
-        checked.append(GatewayPlan(gateway, _client_topics(lookup, gateway)))
+        checked.append(GatewayPlan(gateway, _client_topics(lookup, gateway), _client_calls(lookup, gateway)))
     return tuple(checked)
 
 
@@ -77,6 +78,34 @@ def _inbound(lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str) -> I
     if ros_type is None:
         return None
     return InboundPlan(inbound, name, ros_type, _deadman(lookup, gateway, inbound, name, ros_type))
+
+
+_CALL_FORMATS = {Transport.TCP: GatewayFormat.JSON_LINES, Transport.WEBSOCKET: GatewayFormat.JSON}
+"""The formats in which clients can call services: a response needs a connection of its own and the caller's `id`."""
+
+
+def _client_calls(lookup: Lookup, gateway: Gateway) -> dict[str, ClientCallPlan]:
+    """Return the services that clients of a gateway may call, except those whose types do not exist."""
+    plans: dict[str, ClientCallPlan | None] = {}
+    for declared in gateway.calls:
+        name = resolved(declared.service.value, lookup.table.node)
+        if name in plans:
+            lookup.report(declared.service.span, Code.BAD_VALUE, f"'{name}' is in 'inbound' twice", "name it once")
+        elif _CALL_FORMATS.get(gateway.transport.value) is not gateway.format:
+            what = f"{gateway.format.value} over {gateway.transport.value.value}"
+            message = f"clients that read {what} cannot call services"
+            hint = "use a gateway with `transport: {websocket: ...}` and 'json', or with tcp and `format: json_lines`"
+            lookup.report(declared.service.span, Code.BAD_VALUE, message, hint)
+        plans[name] = _client_call(lookup, gateway, declared, name)
+    return {name: plan for name, plan in plans.items() if plan}
+
+
+def _client_call(lookup: Lookup, gateway: Gateway, declared: InboundService, name: str) -> ClientCallPlan | None:
+    if (halves := service_type(lookup, declared.type)) is None:
+        return None
+    request, response = halves
+    definitions = definitions_of(request) | definitions_of(response)
+    return ClientCallPlan(declared, f"{gateway.name}:{name}", name, request, response, definitions)
 
 
 def _deadman(

@@ -288,11 +288,11 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "too_large": "longer than the gateway accepts, before or after decompression",
     "malformed": "not a packet or document in the gateway's format, or not JSON",
     "source_mismatch": "not from the host that the gateway sends to",
-    "not_allowed": "a topic that is not in `inbound`",
+    "not_allowed": "a topic or service that is not in `inbound`",
     "wrong_type": "not the type that `inbound` declares",
     "invalid": "a field is missing, unknown, of another type or out of range",
     "premature": "its `time` is further in the future than `max_lead`",
-    "rate_limited": "schemas were requested too often",
+    "rate_limited": "schemas were requested too often, or a service was called by a client that was behind",
 }
 """Reasons why a gateway rejected a client's message, with their meaning."""
 
@@ -313,12 +313,12 @@ INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """The DROP_REASONS that apply to messages of clients."""
 
 CALL_OUTCOMES: Mapping[str, str] = {
-    "answered": "the endpoint replied; with `call`, the server responded",
+    "answered": "the endpoint replied; a ROS server that is called responded",
     "timed_out": "no reply came within `timeout`, after all `retries`",
-    "busy": "an earlier call was open, and without `match` there is one at a time; with `call`, 64 were open",
-    "unsent": "the endpoint could not be sent to; with `call`, there was no server",
-    "refused": "the call was older than `ttl`, or its values do not fit the request; with `call`, the reply",
-    "cancelled": "a reload or the stop of the router ended it",
+    "busy": "an earlier call was open, and without `match` there is one at a time; to a ROS server, 64 were open",
+    "unsent": "the endpoint could not be sent to, or there was no ROS server",
+    "refused": "the call was older than `ttl`, beyond `max_rate`, or its values or those of the reply do not fit",
+    "cancelled": "a reload or the stop of the router ended it, or its client left the gateway",
 }
 """How a call of a service ends, with the meaning."""
 

@@ -171,3 +171,6 @@ def _open_gateway(counters: Counters, plan: GatewayPlan) -> None:
         _open_each(counters, "qos_incompatible", name, topic, last=QOS_POLICIES)
         if inbound.deadman is not None:
             _open_deadman(counters, inbound.deadman)
+    for call in plan.calls.values():
+        _open_each(counters, "service_calls", call.name, last=CALL_OUTCOMES)
+        _open(counters, ("service_calls_open", "service_call_seconds"), call.name)

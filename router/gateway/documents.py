@@ -7,6 +7,8 @@
     {"op": "rejected", "reason": R, "detail": TEXT, "topic": T}
     {"op": "publish", "topic": T, "type": N, "time": S, "data": {...}}   to the gateway; type and time may be left out
     {"op": "schema", "type": N}                                          requests a schema; all without `type`
+    {"op": "call", "service": S, "id": I, "type": N, "request": {...}}   calls a service; type may be left out
+    {"op": "response", "id": I, "response": {...}}                       to the client; or with "reason": TEXT
 
 Times are wall-clock seconds. No document has a newline in it.
 """
@@ -14,7 +16,7 @@ Times are wall-clock seconds. No document has a newline in it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, Union
+from typing import Annotated, NamedTuple, Union
 
 import msgspec
 import orjson
@@ -41,7 +43,16 @@ class SchemaRequest(NamedTuple):
     type_name: str | None
 
 
-Request = Union[PublishRequest, SchemaRequest]
+class CallRequest(NamedTuple):
+    """A client's call of a service: the JSON text of its request. The response has the same `id`."""
+
+    service: str
+    type_name: str | None
+    id: int
+    data: bytes
+
+
+Request = Union[PublishRequest, SchemaRequest, CallRequest]
 
 
 def data_document(topic: str, type_name: str, time: float, text: bytes) -> bytes:
@@ -80,6 +91,16 @@ def rejected_document(reason: str, detail: str, topic: str) -> bytes:
     return orjson.dumps({"op": "rejected", "reason": reason, "detail": detail, "topic": topic})
 
 
+def response_document(number: int, text: bytes) -> bytes:
+    """Make a document of a response to the call with this `id` from its JSON text."""
+    return b'{"op":"response","id":%d,"response":%b}' % (number, text)
+
+
+def no_response_document(number: int, reason: str) -> bytes:
+    """Make a document that says why a call has no response."""
+    return orjson.dumps({"op": "response", "id": number, "reason": reason})
+
+
 class _Publish(msgspec.Struct, tag_field="op", tag="publish", forbid_unknown_fields=True, gc=False):
     topic: str
     data: msgspec.Raw
@@ -91,7 +112,14 @@ class _Schema(msgspec.Struct, tag_field="op", tag="schema", forbid_unknown_field
     type: str | None = None
 
 
-_read = reader(msgspec.json.Decoder(Union[_Publish, _Schema]))
+class _Call(msgspec.Struct, tag_field="op", tag="call", forbid_unknown_fields=True, gc=False):
+    service: str
+    id: Annotated[int, msgspec.Meta(ge=-(1 << 53), le=1 << 53)]  # what JavaScript represents
+    request: msgspec.Raw
+    type: str | None = None
+
+
+_read = reader(msgspec.json.Decoder(Union[_Publish, _Schema, _Call]))
 
 
 def request(text: bytes) -> Request:
@@ -102,4 +130,6 @@ def request(text: bytes) -> Request:
         raise PacketError(f"not a request: {shown(str(error))}") from None
     if isinstance(document, _Schema):
         return SchemaRequest(document.type)
+    if isinstance(document, _Call):
+        return CallRequest(document.service, document.type, document.id, bytes(document.request))
     return PublishRequest(document.topic, document.type, document.time, bytes(document.data))

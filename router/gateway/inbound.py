@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from router.carrier.limits import Freshness, RateLimit
 from router.compiler.compiled_table import GatewayPlan, InboundPlan
 from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters, Report
-from router.gateway.documents import PublishRequest, SchemaRequest
+from router.gateway.documents import CallRequest, PublishRequest, SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.json_codec import InvalidMessageError, decoder
 from router.gateway.json_types import Style
@@ -97,15 +97,15 @@ class InboundPublisher:
         self._outputs.report(Report("reject", self._gateway, "", reason, None, detail))
         return RefusedError(reason, detail, topic)
 
-    def receive(self, data: bytes, arrived_ns: int) -> SchemaRequest | None:
-        """Publish a client's message, or return its request for schemas. `arrived_ns` is wall-clock time.
+    def receive(self, data: bytes, arrived_ns: int) -> SchemaRequest | CallRequest | None:
+        """Publish a client's message, or return its request for schemas or its call. `arrived_ns` is wall-clock time.
 
         Raises RefusedError, which is counted and reported.
         """
         topic = ""
         try:
             request = self._encoding.request(data)
-            if isinstance(request, SchemaRequest):
+            if isinstance(request, (SchemaRequest, CallRequest)):
                 return request
             topic = request.topic
             allowed = self._allowed(request)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from itertools import count
 
 from router.compiler.compiled_table import GatewayPlan
+from router.gateway.calls import ClientCalls
 from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
-from router.gateway.documents import inbound_document, rejected_document, topics_document
+from router.gateway.documents import (
+    CallRequest,
+    inbound_document,
+    no_response_document,
+    rejected_document,
+    topics_document,
+)
 from router.gateway.encoding import ENCODINGS
 from router.gateway.inbound import InboundPublisher, RefusedError
 from router.gateway.json_types import Style
@@ -34,6 +43,7 @@ class GatewayService:
         context: GatewayContext,
         counters: GatewayCounters,
         inbound: InboundPublisher,
+        calls: ClientCalls,
         transport: Callable[[GatewayService], Transport],
     ) -> None:
         settings = plan.settings
@@ -43,6 +53,8 @@ class GatewayService:
         self._context = context
         self._counters = counters
         self._inbound = inbound
+        self._calls = calls
+        self._responses = count()
         self._encoding = ENCODINGS[settings.format](settings)
         self._tasks = Tasks(context.failed)
         self._new_transport = transport
@@ -57,11 +69,16 @@ class GatewayService:
 
     def replacement(self) -> GatewayService:
         """Return a new service to replace this closed one: with the same limits and counters, without clients."""
-        return GatewayService(self.plan, self._context, self._counters, self._inbound, self._new_transport)
+        return GatewayService(self.plan, self._context, self._counters, self._inbound, self._calls, self._new_transport)
 
     async def open(self) -> None:
         """Open the transport. Raises StartError if it cannot be opened."""
-        await self._transport.open()
+        self._calls.open(self._respond, self._tasks)
+        try:
+            await self._transport.open()
+        except BaseException:
+            self._calls.close()
+            raise
 
     def start(self) -> None:
         """Start to discover and serve topics."""
@@ -82,6 +99,11 @@ class GatewayService:
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)
+            closing.push_async_callback(self._end_calls)
+
+    async def _end_calls(self) -> None:
+        self._calls.close()
+        await asyncio.sleep(0)  # in this turn of the loop, clients get what has been written
 
     async def _flush_logs(self) -> None:
         self.clients.log.flush()
@@ -99,6 +121,7 @@ class GatewayService:
 
     def left(self, client: Client) -> None:
         self.clients.left(client)
+        self._calls.left(client)
 
     def drained(self, client: Client) -> None:
         self.clients.drained(client)
@@ -126,7 +149,9 @@ class GatewayService:
         except RefusedError as refused:
             self._send_refusal(client, refused)
         else:
-            if wanted is not None:
+            if isinstance(wanted, CallRequest):
+                self._call(client, wanted)
+            elif wanted is not None:
                 self._show_schemas(client, wanted.type_name)
 
     # -- answers -------------------------------------------------------------------------------------------------
@@ -139,6 +164,26 @@ class GatewayService:
             self._explained = now
             document = rejected_document(refused.reason, str(refused), refused.topic)
             self.clients.send_to(queue, [self._document("rejected", document)])
+
+    def _call(self, client: Client, request: CallRequest) -> None:
+        queue = self.clients.queues.get(client)
+        if queue is None or not queue.keeps_up:  # responses to it wait without a limit of their own
+            refused = self._inbound.refusal("rate_limited", "earlier documents must be read before a call")
+            self._send_refusal(client, refused)
+            return
+        try:
+            self._calls.call(client, request)
+        except RefusedError as refused:
+            if self._is_shared:
+                self._send_refusal(client, refused)
+            else:
+                self._respond(client, no_response_document(request.id, str(refused)))
+
+    def _respond(self, client: Client, document: bytes) -> None:
+        """Send a response to a call; it is lost if the client has left."""
+        if (queue := self.clients.queues.get(client)) is not None:
+            kind = f"response {next(self._responses)}"  # none replaces another one
+            self.clients.send_to(queue, [self._document(kind, document)])
 
     def _show_schemas(self, client: Client, type_name: str | None) -> None:
         now = self._context.clock_ns()

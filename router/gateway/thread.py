@@ -17,6 +17,7 @@ from router.clock import boottime_ns, wall_ns
 from router.compiler.compiled_table import CompiledTable, GatewayPlan
 from router.compiler.metrics import Report
 from router.errors import StartError
+from router.gateway.calls import ClientCalls
 from router.gateway.clients import ClientQueue
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters
@@ -44,7 +45,7 @@ if TYPE_CHECKING:  # which imports rclpy
 T = TypeVar("T")
 
 MOST_REQUEST = 4096
-"""Maximum bytes of a message from a client that may not publish: it can only request schemas."""
+"""Maximum bytes of a message from a client that may not publish or call: it can only request schemas."""
 
 _PATIENCE_S = 5.0
 """Seconds that a change of gateways may take in the event loop; opening a Zenoh session takes some."""
@@ -178,9 +179,12 @@ class GatewayThread:
         http = program.table.http.address.value if program.table.http else None  # fixed while the router runs
         gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, boottime_ns)
         inbound = InboundPublisher(plan, ENCODINGS[settings.format](settings), counters, self._counts, outputs)
-        service = GatewayService(
-            plan, self._context, gateway_counters, inbound, lambda events: self._transport(settings, http, events)
-        )
+        calls = ClientCalls(plan, counters, self._counts, outputs, inbound, self._converting, self._ros.open_client)
+
+        def new_transport(events: Events) -> Transport:
+            return self._transport(settings, http, events)
+
+        service = GatewayService(plan, self._context, gateway_counters, inbound, calls, new_transport)
         try:
             await service.open()
         except StartError as error:
@@ -238,7 +242,7 @@ async def _close(services: Iterable[GatewayService]) -> None:
 
 def _new_transport(settings: Gateway, http: Address | None, events: Events, door: Door) -> Transport:
     """Return the transport for a gateway's settings, not open yet. `http` has the status page."""
-    most = settings.max_inbound if settings.inbound else MOST_REQUEST
+    most = settings.max_inbound if settings.inbound or settings.calls else MOST_REQUEST
     if settings.zenoh is not None:
         from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
 

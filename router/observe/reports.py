@@ -24,7 +24,7 @@ _EVENTS = {
     "supersede": "datagram has several payloads; only the last one counts",
     "drop": "message dropped",
     "deadman": "deadman could not send",
-    "call": "call of a service was not answered by the endpoint",
+    "call": "call of a service was not answered",
     "reply": "reply for a service was dropped",
 }
 """Log events by kind of report."""

@@ -8,7 +8,7 @@ from functools import partial
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from router.compiler.compiled_table import CalledPlan, ServicePlan, TopicPlan
+from router.compiler.compiled_table import CalledPlan, ClientCallPlan, ServicePlan, TopicPlan
 from router.declared import Demand
 from router.errors import SourceSpan
 from router.ros.endpoints import Publication, RosChange, Subscription, open_missing, unused
@@ -112,7 +112,7 @@ class RouterNode:
         """Open a service whose requests add to `eventfd`, for the caller to close. Raises StartError."""
         return ServedService(self._node, plan, eventfd)
 
-    def open_client(self, plan: CalledPlan, eventfd: int) -> CallingClient:
+    def open_client(self, plan: CalledPlan | ClientCallPlan, eventfd: int) -> CallingClient:
         """Open a client of a service whose responses add to `eventfd`, likewise."""
         return CallingClient(self._node, plan, eventfd)
 

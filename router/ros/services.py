@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from router.clock import wall_ns
-from router.compiler.compiled_table import CalledPlan, ServicePlan
+from router.compiler.compiled_table import CalledPlan, ClientCallPlan, ServicePlan
 from router.ros.node import RCL_ERRORS, start_error
 from router.ros.rcl import RCL
 from router.ros.receiving import ADD_TO_EVENTFD
@@ -94,7 +94,7 @@ class ServedService:
 class CallingClient:
     """A client of the node. Responses add to an eventfd. For one thread."""
 
-    def __init__(self, node: Node, plan: CalledPlan, eventfd: int) -> None:
+    def __init__(self, node: Node, plan: CalledPlan | ClientCallPlan, eventfd: int) -> None:
         """Open the client. Raises StartError if its type is not installed, or the middleware refuses it."""
         self.plan = plan
         self._node = node

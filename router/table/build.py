@@ -29,6 +29,7 @@ from router.table.model.gateways import (
     IgnoredGateway,
     Inbound,
     InboundDeadman,
+    InboundService,
     TopicPattern,
     TopicRate,
     Transport,
@@ -590,7 +591,21 @@ def _gateway(entry: Entry) -> Gateway | IgnoredGateway:
         zenoh=structure(ZenohSettings, mapping(chosen.value)) if transport is Transport.ZENOH else None,
         format=GatewayFormat(format_.value) if format_ else DEFAULT_FORMATS[transport],
         rates=tuple(_rates(settings.get("rates"))),
+        **_from_clients(settings.get("inbound")),
     )
+
+
+def _from_clients(inbound: Node | None) -> dict[str, tuple[object, ...]]:
+    """Return the topics and the services in `inbound`, as attributes of a gateway."""
+    topics: list[Inbound] = []
+    services: list[InboundService] = []
+    for node in _members(inbound):
+        settings, span = mapping(node), _item_span(node)
+        if "service" in settings.entries:
+            services.append(structure(InboundService, settings, span=span))
+        else:
+            topics.append(_inbound(settings, span))
+    return {"inbound": tuple(topics), "calls": tuple(services)}
 
 
 def _transport_address(transport: Transport, written: Located[str]) -> Located[Address]:
@@ -641,11 +656,11 @@ def _rates(node: Node | None) -> Iterator[TopicRate]:
         yield TopicRate(pattern, parsed(TOPIC_RATE.parse, Located(rate.value, rate.span)))
 
 
-def _inbound(node: Node, span: SourceSpan) -> Inbound:
-    settings = mapping(node)
+def _inbound(settings: MappingNode, span: SourceSpan) -> Inbound:
     entry = settings.entries.get("deadman")
     deadman = _inbound_deadman(entry) if entry else None
-    return structure(Inbound, settings, **_without_ttl(settings), span=span, topic=_topic(node, span), deadman=deadman)
+    topic = _topic(settings, span)
+    return structure(Inbound, settings, **_without_ttl(settings), span=span, topic=topic, deadman=deadman)
 
 
 def _inbound_deadman(entry: Entry) -> InboundDeadman:
@@ -659,7 +674,6 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     Expression: _expression,
     FieldMap: _fields,
     IPv4Network: lambda node, _: _network(node),
-    Inbound: _inbound,
     Obeyed: _obeyed,
     StreamFraming: lambda node, _: _stream_framing(node),
     Topic: _topic,

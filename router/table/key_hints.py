@@ -200,16 +200,29 @@ def _owners(name: str, path: Path) -> str:
         owners = [owner for owner in owners if not owner.startswith(("service", "called"))]
     elif "service" in owners:
         return "remove it: a service that a board answers and one with 'call' have different keys"
+    if path[-2:-1] == ("inbound",) and not _INBOUND.isdisjoint(owners):
+        if "inbound_deadman" not in owners:
+            return "remove it: an item of 'inbound' with 'topic' and one with 'service' have different keys"
+        owners = [owner for owner in owners if owner not in _INBOUND]
     near = [owner for owner in owners if owner in _OF_PART.get(str(path[0]) if path else "", ())] or owners
     named = [*dict.fromkeys(_NAMES[owner] for owner in near)]
     named += ["the top level"] if name in keys_of(table_schema()) else []
     return f"move it to {', or to '.join(named)}" if named else ""
 
 
+_INBOUND = {"inbound_topic", "inbound_service"}
 _OF_PART = {
     "routes": ("route", "destination", "topic"),
     "services": ("service", "service_request", "service_reply"),
-    "gateways": ("gateway", "inbound", "transport", "zenoh", "topic_pattern", "inbound_deadman"),
+    "gateways": (
+        "gateway",
+        "inbound_topic",
+        "inbound_service",
+        "transport",
+        "zenoh",
+        "topic_pattern",
+        "inbound_deadman",
+    ),
 }
 """Definitions where a key belongs that is misplaced in this part of a table."""
 _NAMES = {
@@ -240,7 +253,7 @@ _NAMES = {
     "transport": "'transport'",
     "zenoh": "'zenoh'",
     "topic_pattern": "an item of 'include' or 'exclude'",
-    "inbound": "an item of 'inbound'",
+    **dict.fromkeys(_INBOUND, "an item of 'inbound'"),
     "inbound_deadman": "the 'deadman' of an item of 'inbound'",
 }
 """Definitions with keys, and how a hint names them."""

@@ -58,6 +58,8 @@ class _Shorthand:
         return _changed(node, "inbound", lambda inbound: _one_or_each(inbound, self._inbound))
 
     def _inbound(self, node: Node) -> Node:
+        if isinstance(node, MappingNode) and "service" in node.entries:
+            return node
         return _changed(self._topic(node), "deadman", self._deadman)
 
     def _topic(self, node: Node) -> Node:

@@ -395,6 +395,10 @@ def explained_gateway(checked: GatewayPlan, topics: Topics) -> Iterator[str]:
     for inbound in checked.inbound.values():
         yield ""
         yield from _inbound(inbound)
+    for call in checked.calls.values():
+        yield ""
+        yield f"  from clients, calls of {call.label}: {call.type_name}  ({call.span})"
+        yield from (f"    {words}" for words in phrases(call.settings).values())
 
 
 def ignored_gateway(gateway: IgnoredGateway) -> Iterator[str]:

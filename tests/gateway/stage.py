@@ -14,9 +14,10 @@ from typing import Any, cast
 
 from router.clock import boottime_ns, wall_ns
 from router.compiler import check_table
-from router.compiler.compiled_table import CompiledTable, GatewayPlan
+from router.compiler.compiled_table import ClientCallPlan, CompiledTable, GatewayPlan
 from router.compiler.metrics import Report
 from router.errors import StartError
+from router.gateway.calls import ClientCalls
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import ENCODINGS
@@ -25,6 +26,7 @@ from router.gateway.service import GatewayService
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
 from router.library import load
+from router.ros.services import CallingClient
 from router.ros.topics import DiscoveredPublisher, RosTopics
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces
@@ -196,10 +198,21 @@ class Stage:
         return GatewayCounters(plan.settings, self._counters, self.counts, self.reports.append, boottime_ns)
 
     def inbound(self, plan: GatewayPlan) -> InboundPublisher:
+        encoding = ENCODINGS[plan.settings.format](plan.settings)
+        return InboundPublisher(plan, encoding, self._counters, self.counts, self._outputs(plan))
+
+    def calls(self, plan: GatewayPlan, inbound: InboundPublisher) -> ClientCalls:
+        def refuse(call: ClientCallPlan, _: int) -> CallingClient:
+            raise AssertionError(f"{call.label} needs ROS")
+
+        outputs, converting = self._outputs(plan), self.context.converting
+        return ClientCalls(plan, self._counters, self.counts, outputs, inbound, converting, refuse)
+
+    def _outputs(self, plan: GatewayPlan) -> InboundOutputs:
         def publisher(topic: str) -> Any:
             return lambda cdr: self.published.append((topic, cdr))
 
-        outputs = InboundOutputs(
+        return InboundOutputs(
             library=load(),
             publish={topic: publisher(topic) for topic in plan.inbound},
             publish_errors=(),
@@ -208,16 +221,15 @@ class Stage:
             clock_ns=boottime_ns,
             wall_ns=wall_ns,
         )
-        encoding = ENCODINGS[plan.settings.format](plan.settings)
-        return InboundPublisher(plan, encoding, self._counters, self.counts, outputs)
 
 
 class Played:
     """One gateway and its client."""
 
     def __init__(self, stage: Stage, plan: GatewayPlan) -> None:
+        counters, inbound = stage.gateway_counters(plan), stage.inbound(plan)
         self.service = GatewayService(
-            plan, stage.context, stage.gateway_counters(plan), stage.inbound(plan), self._transport
+            plan, stage.context, counters, inbound, stage.calls(plan, inbound), self._transport
         )
         self._is_open = False
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from router.table.grammar.keys import REASON, TEXT, Schema, about, key, mapping, part, properties, ref, required
-from router.table.grammar.rules import CALLS, ENDPOINT, GATEWAY, LIMIT, ROUTE, STATE, alone, without
+from router.table.grammar.rules import CALLS, ENDPOINT, GATEWAY, IS_CALLED, LIMIT, ROUTE, STATE, alone, without
 from router.table.grammar.values import expression, one_of
 from router.table.model.endpoints import Endpoint, Listener
-from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, ZenohSettings
+from router.table.model.gateways import Gateway, IgnoredGateway, Inbound, InboundDeadman, InboundService, ZenohSettings
 from router.table.model.routes import Collect, Deadman, DeadmanKeys, Obeyed, Route
 from router.table.model.serial import SerialLine
 from router.table.model.services import (
@@ -258,7 +258,9 @@ PARTS: Schema = {
     },
     "transport": _TRANSPORT,
     "zenoh": part(ZenohSettings),
-    "inbound": _INBOUND,
+    "inbound": {"if": IS_CALLED, "then": ref("inbound_service"), "else": ref("inbound_topic")},
+    "inbound_topic": _INBOUND,
+    "inbound_service": {**part(InboundService), "required": required(InboundService)},
     "inbound_deadman": {**_INBOUND_DEADMAN, "required": ["send"]},
     "source_topic": _SOURCE_TOPIC,
     "source": _SOURCE,

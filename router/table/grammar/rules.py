@@ -50,6 +50,8 @@ def _each(schema: Schema) -> Schema:
 
 CALLS: Schema = {"type": "object", "required": ["call"]}
 """A service that an endpoint calls."""
+IS_CALLED: Schema = {"type": "object", "required": ["service"]}
+"""A service that clients of a gateway call."""
 
 # -- required keys
 

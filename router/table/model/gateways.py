@@ -13,7 +13,7 @@ from router.table.keys import SOME, Named, OneOf, Range, Shape, Words
 from router.table.model.expressions import FieldMap
 from router.table.model.routes import DeadmanKeys
 from router.table.model.targets import Topic
-from router.table.units import DATAGRAM_SIZE, DURATION, INTERVAL, MESSAGE_SIZE, PERIOD, TOPIC_RATE
+from router.table.units import DATAGRAM_SIZE, DURATION, INTERVAL, MESSAGE_SIZE, PERIOD, RATE, TOPIC_RATE
 
 
 class Transport(enum.Enum):
@@ -170,12 +170,47 @@ class Inbound:
 
 
 @dataclass(frozen=True, slots=True)
+class InboundService:
+    """A ROS service that clients may call, over tcp with 'json_lines' and over websocket with 'json'.
+
+    `timeout` is in ns, `max_rate` in Hz.
+
+    Title: Inbound service
+    """
+
+    span: SourceSpan
+    service: Annotated[Located[str], Shape("service_name")]
+    """The name of the service in ROS, which is resolved in the node's namespace. Clients use the absolute name.
+
+    Example: arm
+    """
+    type: Located[str]
+    """The ROS service type.
+
+    Example: std_srvs/srv/SetBool
+    """
+    timeout: Annotated[Located[int], DURATION, Words("waits {} for the response")]
+    """How long to wait for the server's response.
+
+    Example: 1s
+    """
+    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
+    """At most this many calls per second of all clients together reach the service, on average; of a burst only the
+    first passes. A number, or a text with its unit.
+
+    Title: Largest rate
+    Example: 2 Hz
+    """
+
+
+@dataclass(frozen=True, slots=True)
 class Gateway:
     """Sends ROS topics of any type to its clients, and publishes their messages on the topics of 'inbound'. Or why it
     is ignored.
 
     `span` is its name in the table. `address` is the clients' address (udp) or the one to listen on (tcp, websocket);
-    None for Zenoh. Periods are in ns, sizes in bytes. `compression` is a zstd level, 0 for none.
+    None for Zenoh. `calls` are the services in 'inbound', whose other items are topics. Periods are in ns, sizes in
+    bytes. `compression` is a zstd level, 0 for none.
     """
 
     name: str
@@ -266,10 +301,13 @@ class Gateway:
     Example: [192.168.0.0/24]
     """
     inbound: tuple[Inbound, ...] = ()
-    """The topics that clients may publish on. Messages for other topics are rejected and counted.
+    """The topics that clients may publish on, and the services that they may call. Messages for others are rejected and
+    counted.
 
     Example: [{topic: /cmd_vel, type: geometry_msgs/msg/Twist}]
+    Example: [{service: /arm, type: std_srvs/srv/SetBool, timeout: 1s}]
     """
+    calls: tuple[InboundService, ...] = ()
 
     @property
     def max_outbound(self) -> int:
