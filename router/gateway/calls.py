@@ -118,19 +118,26 @@ class ClientCalls:
             for call in [each for each in service.open.values() if each.client is client]:
                 self._fail(service, call, "cancelled")
 
-    def call(self, client: Client, request: CallRequest) -> None:
-        """Call a service. Raises RefusedError, which is counted and reported, if the request is wrong."""
+    def call(self, client: Client, request: CallRequest, arrived_ns: int) -> None:
+        """Call a service. `arrived_ns` is wall-clock time.
+
+        Raises RefusedError, which is counted and reported, if the request is wrong.
+        """
         name = request.service
         if (service := self._services.get(name)) is None:
             raise self._inbound.refusal("not_allowed", f"clients may not call '{name[:80]}'", name)
         if request.type_name not in (None, service.plan.type_name):
             raise self._inbound.refusal("wrong_type", f"{name} has the type {service.plan.type_name}", name)
+        limits = service.plan.settings
         try:
+            self._inbound.check_time(name, limits, request.time)
             cdr = service.decode(request.data)
         except (InvalidMessageError, PacketError) as error:
             raise self._inbound.refusal("invalid", str(error), name) from error
         now = self._outputs.clock_ns()
-        if service.may_pass and not service.may_pass(now):
+        if detail := self._inbound.staleness(name, limits, request.time, arrived_ns, now):
+            self._refuse(service, client, request, "refused", detail)
+        elif service.may_pass and not service.may_pass(now):
             self._refuse(service, client, request, "refused", f"called more often than {service.max_rate:g} Hz")
         elif len(service.open) >= MOST_OPEN:
             self._refuse(service, client, request, "busy")

@@ -7,7 +7,7 @@
     {"op": "rejected", "reason": R, "detail": TEXT, "topic": T}
     {"op": "publish", "topic": T, "type": N, "time": S, "data": {...}}   to the gateway; type and time may be left out
     {"op": "schema", "type": N}                                          requests a schema; all without `type`
-    {"op": "call", "service": S, "id": I, "type": N, "request": {...}}   calls a service; type may be left out
+    {"op": "call", "service": S, "id": I, "type": N, "time": S, "request": {...}}   calls a service, likewise
     {"op": "response", "id": I, "response": {...}}                       to the client; or with "reason": TEXT
 
 Times are wall-clock seconds. No document has a newline in it.
@@ -44,10 +44,11 @@ class SchemaRequest(NamedTuple):
 
 
 class CallRequest(NamedTuple):
-    """A client's call of a service: the JSON text of its request. The response has the same `id`."""
+    """A client's call of a service: the JSON text of its request. The response has the same `id`. `time` as above."""
 
     service: str
     type_name: str | None
+    time: float | None
     id: int
     data: bytes
 
@@ -117,6 +118,7 @@ class _Call(msgspec.Struct, tag_field="op", tag="call", forbid_unknown_fields=Tr
     id: Annotated[int, msgspec.Meta(ge=-(1 << 53), le=1 << 53)]  # what JavaScript represents
     request: msgspec.Raw
     type: str | None = None
+    time: float | None = None
 
 
 _read = reader(msgspec.json.Decoder(Union[_Publish, _Schema, _Call]))
@@ -131,5 +133,5 @@ def request(text: bytes) -> Request:
     if isinstance(document, _Schema):
         return SchemaRequest(document.type)
     if isinstance(document, _Call):
-        return CallRequest(document.service, document.type, document.id, bytes(document.request))
+        return CallRequest(document.service, document.type, document.time, document.id, bytes(document.request))
     return PublishRequest(document.topic, document.type, document.time, bytes(document.data))

@@ -15,6 +15,7 @@ from router.gateway.json_codec import InvalidMessageError, decoder
 from router.gateway.json_types import Style
 from router.gateway.packets import PacketError, TooLargeError, decompress
 from router.log import FloodLog, logger
+from router.table.model.gateways import InboundAge
 
 CLOCK_TOLERANCE_NS = 20_000_000
 """How far a client's clock may be ahead without being reported; clocks synchronized by NTP differ less."""
@@ -52,9 +53,7 @@ class _Topic:
     def __init__(self, library: ctypes.CDLL, plan: InboundPlan, style: Style, counters: Counters, gateway: str) -> None:
         self.plan = plan
         self.decode = decoder(plan.type, style)
-        self.max_rate, ttl = plan.settings.topic.max_rate, plan.settings.ttl
-        self.ttl = ttl.value if ttl else None
-        self.max_lead = plan.settings.max_lead
+        self.max_rate = plan.settings.topic.max_rate
         self.may_pass = RateLimit(library, self.max_rate).may_pass if self.max_rate is not None else None
         self.published = counters.index("messages_published", gateway, plan.label)
         self.dropped = {
@@ -127,15 +126,19 @@ class InboundPublisher:
         wanted = topic.plan.type.name
         if request.type_name not in (None, wanted):
             raise self.refusal("wrong_type", f"{name} has the type {wanted}", name)
-        if topic.ttl is None:
-            return topic
-        if request.time is None:
-            raise InvalidMessageError(f"{name} requires `time`, the time of sending")
-        lead = request.time - self._outputs.wall_ns() / 1e9
-        if lead * 1e9 > topic.max_lead:
-            detail = f"{lead:.6g} s in the future, and more than {topic.max_lead / 1e9:g} s; are both clocks right?"
-            raise self.refusal("premature", detail, name)
+        self.check_time(name, topic.plan.settings, request.time)
         return topic
+
+    def check_time(self, name: str, limits: InboundAge, time: float | None) -> None:
+        """Check the time in a request, if there is a `ttl`. Raises RefusedError, InvalidMessageError."""
+        if limits.ttl is None:
+            return
+        if time is None:
+            raise InvalidMessageError(f"{name} requires `time`, the time of sending")
+        lead = time - self._outputs.wall_ns() / 1e9
+        if lead * 1e9 > limits.max_lead:
+            detail = f"{lead:.6g} s in the future, and more than {limits.max_lead / 1e9:g} s; are both clocks right?"
+            raise self.refusal("premature", detail, name)
 
     def _text(self, request: PublishRequest) -> bytes:
         """Return the JSON text of a message. Raises PacketError."""
@@ -147,8 +150,8 @@ class InboundPublisher:
         """Publish a message. `sent` is the client's wall clock in seconds."""
         self._counts[self._accepted] += 1
         now = self._counts[self._last] = self._outputs.clock_ns()
-        if topic.ttl is not None and sent is not None:
-            self._check_age(topic, topic.ttl, sent, arrived_ns, now)
+        if detail := self.staleness(topic.plan.label, topic.plan.settings, sent, arrived_ns, now):
+            raise self._dropped(topic, "stale", detail)
         if topic.may_pass and not topic.may_pass(now):
             raise self._dropped(topic, "rate_limited", f"more often than {topic.max_rate:g} Hz")
         try:
@@ -159,29 +162,31 @@ class InboundPublisher:
             self._outputs.feed_deadman[topic.plan.deadman.route](now)
         self._counts[topic.published] += 1
 
-    def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:
-        """Raise RefusedError if more than `ttl` has passed since `sent` or the arrival, whichever is earlier.
+    def staleness(self, name: str, limits: InboundAge, sent: float | None, arrived_ns: int, now: int) -> str:
+        """Return a sentence if more than `ttl` has passed since `sent` or the arrival, whichever is earlier.
 
         If a client's clock is ahead, its messages stay valid for that much longer. The log compares `sent` with the
         present time: if the event loop was blocked, `arrived_ns` is only the earliest possible arrival.
         """
-        wall = self._outputs.wall_ns()
+        if limits.ttl is None or sent is None:
+            return ""
+        ttl, wall = limits.ttl.value, self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
         age = now - self._freshness.times(stamp, wall, now).youngest
         if age > ttl:
-            detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
-            raise self._dropped(topic, "stale", detail)
+            return f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
         if (ahead := sent - wall / 1e9) * 1e9 > CLOCK_TOLERANCE_NS:
             self._counts[self._clock_ahead] += 1
             self.log.note(
-                topic.plan.label,
+                name,
                 logger.warning,
                 "a client's clock is ahead, so its messages stay valid for longer than ttl",
                 gateway=self._gateway,
-                topic=topic.plan.label,
+                topic=name,
                 ahead_s=round(ahead, 3),
                 ttl_s=ttl / 1e9,
             )
+        return ""
 
     def _dropped(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
         """Count an accepted message that is not published, and report it. Return the error."""

@@ -150,7 +150,7 @@ class GatewayService:
             self._send_refusal(client, refused)
         else:
             if isinstance(wanted, CallRequest):
-                self._call(client, wanted)
+                self._call(client, wanted, arrived_ns)
             elif wanted is not None:
                 self._show_schemas(client, wanted.type_name)
 
@@ -165,14 +165,14 @@ class GatewayService:
             document = rejected_document(refused.reason, str(refused), refused.topic)
             self.clients.send_to(queue, [self._document("rejected", document)])
 
-    def _call(self, client: Client, request: CallRequest) -> None:
+    def _call(self, client: Client, request: CallRequest, arrived_ns: int) -> None:
         queue = self.clients.queues.get(client)
         if queue is None or not queue.keeps_up:  # responses to it wait without a limit of their own
             refused = self._inbound.refusal("rate_limited", "earlier documents must be read before a call")
             self._send_refusal(client, refused)
             return
         try:
-            self._calls.call(client, request)
+            self._calls.call(client, request, arrived_ns)
         except RefusedError as refused:
             if self._is_shared:
                 self._send_refusal(client, refused)

@@ -602,7 +602,7 @@ def _from_clients(inbound: Node | None) -> dict[str, tuple[object, ...]]:
     for node in _members(inbound):
         settings, span = mapping(node), _item_span(node)
         if "service" in settings.entries:
-            services.append(structure(InboundService, settings, span=span))
+            services.append(structure(InboundService, settings, **_without_ttl(settings), span=span))
         else:
             topics.append(_inbound(settings, span))
     return {"inbound": tuple(topics), "calls": tuple(services)}

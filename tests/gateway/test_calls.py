@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,8 +18,9 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from websockets.sync.client import ClientConnection, connect
 
-from router.compiler.metrics import Report
+from router.compiler.metrics import CALL_OUTCOMES, Report
 from router.gateway import calls, encoding
+from router.gateway.clients import ClientQueue
 from router.gateway.thread import GatewayThread
 from router.library import load
 from tests.acceptance.service_server import ServiceServer
@@ -33,6 +36,7 @@ GATEWAY = f"""it: {{transport: {{websocket: "127.0.0.1:PORT"}}, discovery_period
   {{service: arm, type: {TYPE}, timeout: 20s}},
   {{service: /slow, type: {TYPE}, timeout: 200ms}},
   {{service: /rare, type: {TYPE}, timeout: 20s, max_rate: 0.01}},
+  {{service: fresh, type: {TYPE}, timeout: 20s, ttl: 300ms}},
   {{service: nobody, type: std_srvs/srv/Trigger, timeout: 20s}}]}}"""
 
 
@@ -43,7 +47,8 @@ class Gateway:
         self.port = free_port(kind=socket.SOCK_STREAM)
         self.reports: list[Report] = []
         self.faults: list[Exception] = []
-        self.made = program(folder, GATEWAY.replace("PORT", str(self.port)))
+        self.table = GATEWAY.replace("PORT", str(self.port))
+        self.made = program(folder, self.table)
         self.counts = self.made.counters.fresh_counts()
         ros = open_ros()
         opened.callback(ros.close)
@@ -54,12 +59,17 @@ class Gateway:
         self._stop.callback(self.thread.stop)
         self.thread.finish(self.thread.prepare(self.made, {}))
 
+    def reload(self, folder: Path, table: str) -> None:
+        change = self.thread.prepare(program(folder, table), {})
+        self.thread.adopt(change)
+        self.thread.finish(change)
+
     def count(self, metric: str, *labels: str) -> int:
         return self.counts[self.made.counters.index(metric, *labels)]
 
     def outcomes(self, service: str) -> dict[str, int]:
         """How calls of the service have ended, and how many are open."""
-        ended = {outcome: self.count("service_calls", f"it:{service}", outcome) for outcome in calls.CALL_OUTCOMES}
+        ended = {outcome: self.count("service_calls", f"it:{service}", outcome) for outcome in CALL_OUTCOMES}
         return {"open": self.count("service_calls_open", f"it:{service}"), **ended}
 
     @contextmanager
@@ -167,11 +177,48 @@ def test_a_late_response_is_ignored(gateway: Gateway) -> None:
         assert gateway.outcomes("/slow")["open"] == 0
 
 
+def test_calls_that_are_old_or_from_the_future_or_without_a_time(gateway: Gateway) -> None:
+    with gateway.client() as client:
+        assert client.asked("/fresh", 1, ON, time=time.time())["reason"] == "there is no server of /fresh"
+        old = client.asked("/fresh", 2, ON, time=time.time() - 60)["reason"]
+        assert re.fullmatch(r"60\.\d+ s old, and older than 0\.3 s; are both clocks right\?", old)
+        assert " s in the future, " in client.asked("/fresh", 3, ON, time=time.time() + 60)["reason"]
+        assert client.asked("/fresh", 4, ON)["reason"] == "/fresh requires `time`, the time of sending"
+    outcomes = gateway.outcomes("/fresh")
+    assert (outcomes["unsent"], outcomes["refused"]) == (1, 1)
+    assert gateway.count("datagrams_rejected", "it", "premature") == 1
+    assert gateway.count("datagrams_rejected", "it", "invalid") == 1
+
+
 def test_calls_beyond_the_largest_rate_are_refused(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.asked("/rare", 1, ON)["reason"] == "there is no server of /rare"
         assert client.asked("/rare", 2, ON)["reason"] == "called more often than 0.01 Hz"
     assert gateway.outcomes("/rare")["refused"] == 1
+
+
+def test_a_client_that_does_not_read_cannot_call(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+    with gateway.client() as client:
+        client.next("inbound")
+        monkeypatch.setattr(ClientQueue, "keeps_up", property(lambda _: False))
+        client.call("/arm", 1, ON)
+        wait_until(lambda: gateway.count("datagrams_rejected", "it", "rate_limited") == 1)
+    assert sum(gateway.outcomes("/arm").values()) == 0
+
+
+def test_a_reload_that_changes_the_gateway_answers_open_calls(gateway: Gateway, tmp_path: Path) -> None:
+    with gateway.client() as client, served("/arm", client) as server:
+        server.wait(1)
+        client.call("/arm", 1, ON)
+        assert server.request() == "True"
+        gateway.reload(tmp_path, gateway.table)  # the gateway keeps its clients and calls
+        assert client.next("response") == {"id": 1, "response": {"success": True, "message": "here"}}
+        client.call("/arm", 2, ON)
+        assert server.request() == "True"
+        gateway.reload(tmp_path, gateway.table.replace("/rare", "/rarer"))
+        assert client.next("response") == {"id": 2, "reason": "the router has reloaded its table, or stops"}
+        with gateway.client() as again:
+            wait_until(lambda: "response" in again.asked("/arm", 3, {"data": False}))
 
 
 def test_too_many_open_calls(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:

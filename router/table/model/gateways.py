@@ -139,20 +139,14 @@ class InboundDeadman(DeadmanKeys):
     """
 
 
-@dataclass(frozen=True, slots=True)
-class Inbound:
-    """A topic that clients may publish on.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InboundAge:
+    """How old what clients send may be. `ttl` and `no_ttl` are as in a route, `max_lead` is in ns."""
 
-    `ttl` and `no_ttl` are as in a route, `max_lead` is in ns.
-
-    Title: Inbound topic
-    """
-
-    topic: Topic
-    span: SourceSpan
     ttl: Annotated[Located[int] | None, DURATION, Shape("age_limit"), Words("dropped when older than {}")] = None
-    """The greatest age of a message when it is published, by the time in the message; older ones are dropped as stale.
-    Default: no limit; {none: why} says that this is intended. The clients' clocks must agree with this computer's.
+    """The greatest age of a message when it is published, or of a call when it is passed on, by the time in it; older
+    ones are dropped as stale or refused. Default: no limit; {none: why} says that this is intended. The clients' clocks
+    must agree with this computer's.
 
     Title: Time to live
     Example: 300ms
@@ -160,17 +154,28 @@ class Inbound:
     """
     no_ttl: Annotated[str | None, Words("no ttl: {}")] = None
     max_lead: Annotated[int, DURATION] = 2_000_000_000
-    """How far the time in a message may be in the future, if there is a 'ttl'. Messages beyond that are refused as
+    """How far the time in a message or call may be in the future, if there is a 'ttl'. Those beyond that are refused as
     premature: somebody could keep them and send them again later.
 
     Title: Largest lead
     Example: 500ms
     """
+
+
+@dataclass(frozen=True, slots=True)
+class Inbound(InboundAge):
+    """A topic that clients may publish on.
+
+    Title: Inbound topic
+    """
+
+    topic: Topic
+    span: SourceSpan
     deadman: InboundDeadman | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class InboundService:
+class InboundService(InboundAge):
     """A ROS service that clients may call, over tcp with 'json_lines' and over websocket with 'json'.
 
     `timeout` is in ns, `max_rate` in Hz.
