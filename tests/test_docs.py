@@ -19,7 +19,7 @@ import yaml
 
 from router.assets import asset
 from router.compiler import check_table
-from router.gateway.documents import PublishRequest, request
+from router.gateway.documents import CallRequest, PublishRequest, request
 from router.gateway.json_codec import decoder, encoder
 from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import Packet, compress, pack, unpack
@@ -164,7 +164,7 @@ def test_the_packet_that_is_taken_apart_is_one_of_the_gateway() -> None:
 
 def test_schema_and_documents_are_as_they_are_shown() -> None:
     assert VECTOR is not None
-    schema, sent, received = examples(PROTOCOL, "json")
+    schema, sent, received, call = examples(PROTOCOL, "json")
     assert json.loads(schema) == json.loads(schema_text(VECTOR, Style.WRAPPED))
     data = next(line for line in map(json.loads, sent.splitlines()) if line["op"] == "data")
     cdr = decoder(VECTOR, Style.PLAIN)(json.dumps(data["data"]).encode())
@@ -175,6 +175,10 @@ def test_schema_and_documents_are_as_they_are_shown() -> None:
     twist = ros_interfaces().get(published.type_name)
     assert twist is not None
     assert decoder(twist, Style.PLAIN)(published.data)
+    called = request(call.encode())
+    assert isinstance(called, CallRequest)
+    assert called.type_name == "std_srvs/srv/SetBool"
+    assert json.loads(called.data) == {"data": True}
 
 
 @contextmanager

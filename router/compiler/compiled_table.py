@@ -424,6 +424,11 @@ class CompiledTable:
         return [*(plan.label for plan in self.services), *(plan.label for plan in self.called)]
 
     @property
+    def client_calls(self) -> list[ClientCallPlan]:
+        """The services that clients of all gateways may call."""
+        return [plan for gateway in self.gateways for plan in gateway.calls.values()]
+
+    @property
     def request_labels(self) -> list[str]:
         """What stands for services as the source of messages."""
         return [*self.service_labels, *(plan.failed for plan in self.called)]

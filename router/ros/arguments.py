@@ -114,7 +114,7 @@ def _topics(program: CompiledTable, node: NodeSettings) -> dict[str, str]:
     plans = [plan.topic for plan in (*program.publishers, *program.subscriptions)]
     inbound = [entry.topic.topic.value for gateway in program.gateways for entry in gateway.settings.inbound]
     services = [*(plan.name for plan in program.services), *(plan.service for plan in program.called)]
-    services += [plan.service for gateway in program.gateways for plan in gateway.calls.values()]
+    services += [plan.service for plan in program.client_calls]
     return {resolved(name, node): name for name in (*plans, *inbound, *services)}
 
 

@@ -18,7 +18,7 @@ from time import monotonic
 from typing import NamedTuple
 
 from router.assets import asset
-from router.compiler.compiled_table import CalledPlan, CompiledTable, ServicePlan
+from router.compiler.compiled_table import CalledPlan, ClientCallPlan, CompiledTable, ServicePlan
 from router.compiler.extras import missing_extras, missing_modules
 from router.errors import Located, StartError, listed, plural, shown_path
 from router.library import load
@@ -428,7 +428,8 @@ def ros(program: CompiledTable) -> Iterator[CheckResult]:
     if not program.uses_ros:
         return
     plans = (*program.publishers, *program.subscriptions)
-    services: tuple[ServicePlan | CalledPlan, ...] = (*program.services, *program.called)
+    services: tuple[ServicePlan | CalledPlan | ClientCallPlan, ...]
+    services = (*program.services, *program.called, *program.client_calls)
     problems = [problem("ROS", obstacle.what, obstacle.hint) for obstacle in obstacles(os.environ)]
     yield from problems
     if problems:  # loading it would end this process

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from router.compiler.compiled_table import CalledPlan, CompiledTable, ServicePlan
+from router.compiler.compiled_table import CalledPlan, ClientCallPlan, CompiledTable, ServicePlan
 from router.compiler.topics import resolved
 from router.errors import StartError, listed, plural
 from router.tools.doctor_checks import DISCOVERY_S, CheckResult, Grade, fine, problem, warning
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 def services(program: CompiledTable) -> Iterator[CheckResult]:
     """Check who offers the services of the table. ROS must be usable here, as `ros` checks."""
-    if not program.services and not program.called:
+    called: list[CalledPlan | ClientCallPlan] = [*program.called, *program.client_calls]
+    if not program.services and not called:
         return
     from router.ros.graph import look_once, servers
     from router.ros.node import middleware
@@ -25,7 +26,7 @@ def services(program: CompiledTable) -> Iterator[CheckResult]:
         return
     settings = program.table.node
     names = {plan.name: plan.ros_name for plan in program.services}
-    names |= {plan.name: resolved(plan.service, settings) for plan in program.called}
+    names |= {plan.name: resolved(plan.service, settings) for plan in called}
     try:
         found = look_once(
             "router_doctor",
@@ -37,12 +38,14 @@ def services(program: CompiledTable) -> Iterator[CheckResult]:
         return
     ours = resolved(settings.name, settings)
     results = [result for plan in program.services for result in _rivals(plan, found[plan.name], ours)]
-    results += [result for plan in program.called for result in _server(plan, names[plan.name], found[plan.name])]
+    own = {plan.ros_name for plan in program.services}
+    others = [plan for plan in called if names[plan.name] not in own]  # the router, if it runs, serves its own
+    results += [result for plan in others for result in _server(plan, names[plan.name], found[plan.name])]
     yield from results
     if all(result.grade is Grade.FINE for result in results):
-        offered, called = len(program.services), len(program.called)
+        offered, with_server = len(program.services), len(others)
         parts = [f"{plural(offered, 'service')} that no other node offers"] if offered else []
-        parts += [f"{plural(called, 'called service')} with a server"] if called else []
+        parts += [f"{plural(with_server, 'called service')} with a server"] if with_server else []
         yield fine("services", listed(parts))
 
 
@@ -54,11 +57,13 @@ def _rivals(plan: ServicePlan, found: Sequence[Server], node: str) -> Iterator[C
         yield warning("services", what, remedy)
 
 
-def _server(plan: CalledPlan, name: str, found: Sequence[Server]) -> Iterator[CheckResult]:
-    """Yield a warning if a service that an endpoint calls has no server, or only those of another type."""
+def _server(plan: CalledPlan | ClientCallPlan, name: str, found: Sequence[Server]) -> Iterator[CheckResult]:
+    """Yield a warning if a service that is called has no server, or only those of another type."""
     if not found:
-        what = f"no server of {name}, which '{plan.name}' calls: every call gets `on_timeout`"
-        yield warning("services", what, "start its node, or correct `call.service`; `ros2 service list` shows names")
+        is_of_board = isinstance(plan, CalledPlan)
+        ends, key = ("gets `on_timeout`", "call.service") if is_of_board else ("fails", "service")
+        what = f"no server of {name}, which '{plan.name}' calls: every call {ends}"
+        yield warning("services", what, f"start its node, or correct `{key}`; `ros2 service list` shows names")
     elif others := sorted({server.type_name for server in found} - {plan.type_name}):
         nodes = sorted({server.node for server in found if server.type_name != plan.type_name})
         what = f"{listed(nodes)} offers {name} as {listed(others)}; '{plan.name}' calls {plan.type_name}"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import socket
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -257,6 +259,21 @@ def test_a_stop_answers_open_calls(gateway: Gateway, dies: bool) -> None:
         assert client.next("response") == {"id": 1, "reason": "the router has reloaded its table, or stops"}
         assert gateway.outcomes("/arm")["cancelled"] == 1
         server.kill()
+
+
+def test_the_program_of_the_guide(gateway: Gateway, tmp_path: Path) -> None:
+    guide = (Path(__file__).parents[2] / "docs/guides/gateways.md").read_text(encoding="utf-8")
+    [text] = re.findall(r"^```python\n(# call\.py: .*?)^```", guide, re.DOTALL | re.MULTILINE)
+    (tmp_path / "call.py").write_text(text)
+
+    def said(service: str) -> tuple[str, str, int]:
+        words = [sys.executable, "call.py", f"ws://127.0.0.1:{gateway.port}/", service]
+        ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+        return ended.stdout, ended.stderr, ended.returncode
+
+    with gateway.client() as client, served("/arm", client):
+        assert said("/arm") == ("{'message': 'here', 'success': True}\n", "", 0)
+    assert said("/disarm") == ("", "clients may not call '/disarm'\n", 1)
 
 
 @pytest.mark.parametrize("limit", [encoding.LARGE, 0])

@@ -23,7 +23,7 @@ from tests.ports import free_port
 
 
 def opened(made: CompiledTable) -> GatewayThread:
-    ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
+    ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=(), open_client=None))
     thread = GatewayThread(ros, load(), made.counters.fresh_counts(), print, print, Counter(), lambda: None)
     try:
         thread.finish(thread.prepare(made, {}))

@@ -59,6 +59,19 @@ def test_a_called_service_without_a_server(tmp_path: Path) -> None:
     assert result in [*examine(tmp_path / "table.yaml", os.environ)]
 
 
+def test_services_that_clients_call(tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    items = [f"{{service: {name}, type: {SETBOOL}, timeout: 1s}}" for name in ("get_home", "lost")]
+    gateway = f"gateways: {{it: {{transport: {{websocket: 127.0.0.1:8601}}, inbound: [{', '.join(items)}]}}}}"
+    path.write_text(f"version: 1\nnode: {{namespace: /doctor}}\n{gateway}\n")
+    program = check_table(path, {}).program
+    assert program is not None
+    assert "and 1 service type of" in next(ros(program)).text
+    lost = "no server of /doctor/lost, which 'it:/doctor/lost' calls: every call fails"
+    with ServiceServer("/doctor/get_home"):
+        wait_until(lambda: [result.text for result in services(program)] == [lost])
+
+
 def test_servers_are_compared_with_the_table(tmp_path: Path) -> None:
     def says(text: str, type_name: str = SETBOOL) -> bool:
         results = found(tmp_path, type_name)
