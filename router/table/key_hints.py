@@ -249,6 +249,7 @@ _NAMES = {
     "stream_framing": "'framing' of a serial line or TCP connection",
     "checksum": "'checksum' of a serial line or TCP connection",
     "endpoint": "an endpoint",
+    "envelope": "an envelope",
     "gateway": "a gateway",
     "transport": "'transport'",
     "zenoh": "'zenoh'",

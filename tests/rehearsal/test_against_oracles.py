@@ -421,7 +421,7 @@ def step_of(both: Both, noise: random.Random) -> None:
             both.change(noise.choice(sorted(CHOICES)), noise.randrange(7))
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [40, pytest.param(750, marks=pytest.mark.slow)])
 def test_long_histories_are_as_the_models_say(count: int) -> None:
     """With one simulation: what one leaves behind does not reach the next."""
     both = Both(SETTINGS[0])
