@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import struct
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from tests.acceptance.site import wait_until
 from tests.app.conftest import Site
 from tests.app.test_starting import end, wait_for_start
 from tests.ports import free_port
+from tests.readable import readable
 from tests.ros.peers import Subscriber
 from tests.routers import MODULE, start
 
@@ -100,7 +100,7 @@ def test_at_the_stop_another_node_gets_it_too(site: Site) -> None:
     with closing(Subscriber("drive", TYPE)) as subscriber:
         with site.router(route() + gateway(port)), driving(site, port) as client:
             assert subscriber.line() == "matched"
-            while not select.select([subscriber.process.stdout], [], [], 0.1)[0]:  # the publisher may not know it yet
+            while not readable(subscriber.process.stdout.fileno(), 0.1):  # the publisher may not know it yet
                 client.sendall(COMMAND)
         while number(subscriber) == 50:
             pass

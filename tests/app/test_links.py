@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import marshal
 import os
-import select
 import tty
 from collections.abc import Iterator
 from fcntl import LOCK_EX, LOCK_NB, LOCK_UN, flock
@@ -26,6 +25,7 @@ from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, let_rest, numbered, udp
 from tests.oracles.framings import BAD, Framing, decoded, encoded
 from tests.ports import free_port
+from tests.readable import readable
 from tests.tables import PROTOS
 
 COBS = Framing("cobs", "crc16_ccitt_false")
@@ -60,7 +60,7 @@ class Board:
     def frames(self, timeout: float = 0.0) -> list[bytes | str]:
         """What has arrived since it was plugged in."""
         until = monotonic() + timeout
-        while select.select([self.fd], [], [], max(0.0, until - monotonic()))[0]:
+        while readable(self.fd, until - monotonic()):
             try:
                 self.received += os.read(self.fd, 65536)
             except OSError:  # the router has not opened it yet
