@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import select
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
@@ -18,8 +17,9 @@ from typing import TYPE_CHECKING, TypeVar
 
 from router.app.change import Change
 from router.clock import boottime_ns, wall_ns
-from router.compiler.compiled_table import ANSWERED, CalledPlan, ClientCallPlan, ServicePlan
-from router.compiler.metrics import CALL_BOUNDS_NS, CALL_OUTCOMES, HISTOGRAM_CELLS, Report
+from router.compiler.call_counters import CallCounters, is_failure
+from router.compiler.compiled_table import CalledPlan, ClientCallPlan, ServicePlan
+from router.compiler.metrics import Report
 from router.log import fault, logger
 from router.services.asking import Asking
 from router.services.calls import NEVER, Calls
@@ -59,19 +59,22 @@ class ServiceChange:
 
 @dataclass(frozen=True, slots=True)
 class _Running:
-    """What calls use of a program: the routes of messages to endpoints, and the counters, both by service."""
+    """What calls use of a program: the routes of messages to endpoints, by label, and the counters, by service."""
 
     routes: Mapping[str, ctypes.Array[c.RosRoute]]
-    counters: Mapping[tuple[str, ...], int]
+    counters: Mapping[str, CallCounters]
+    retries: Mapping[str, int]
+    unmatched: Mapping[str, int]
 
     @classmethod
     def of(cls, program: CompiledTable, routes: Mapping[str, ctypes.Array[c.RosRoute]]) -> _Running:
-        metrics = "service_calls_open", "service_call_seconds", "service_retries", "service_replies_unmatched"
-        index, counters = program.counters.index, dict[tuple[str, ...], int]()
-        for name in [*(plan.name for plan in program.services), *(plan.name for plan in program.called)]:
-            counters |= {(metric, name): index(metric, name) for metric in metrics}
-            counters |= {(name, outcome): index("service_calls", name, outcome) for outcome in CALL_OUTCOMES}
-        return cls(routes, counters)
+        counters, answered = program.counters, [plan.name for plan in program.services]
+        return cls(
+            routes,
+            {name: CallCounters.of(counters, name) for name in program.service_names},
+            {name: counters.index("service_retries", name) for name in answered},
+            {name: counters.index("service_replies_unmatched", name) for name in answered},
+        )
 
 
 class Services:
@@ -86,7 +89,7 @@ class Services:
         self._calling: dict[str, CallingClient] = {}
         self._asking: Asking | None = None
         self._calls: Calls[tuple[ServedService, Request]] | None = None
-        self._running = _Running({}, {})
+        self._running = _Running({}, {}, {}, {})
         self._replies: deque[Reply] = deque()
         self._eventfd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._thread: Thread | None = None
@@ -228,7 +231,7 @@ class Services:
         if self._calls is None or self._asking is None:
             return
         for name, number in {**self._calls.open_calls(), **self._asking.open_requests()}.items():
-            self._counts[self._running.counters["service_calls_open", name]] = number
+            self._counts[self._running.counters[name].open] = number
 
     # effects of calls
 
@@ -236,7 +239,7 @@ class Services:
         return self._sender.send(self._running.routes[plan.label], request, called_at)
 
     def send_again(self, plan: ServicePlan, datagram: bytes) -> str | None:
-        self._counts[self._running.counters["service_retries", plan.name]] += 1
+        self._counts[self._running.retries[plan.name]] += 1
         return self._sender.send_again(self._running.routes[plan.label], datagram)
 
     def answer(self, plan: ServicePlan, caller: tuple[ServedService, Request], response: bytes) -> None:
@@ -251,16 +254,12 @@ class Services:
 
     def _count(self, name: str, other: str, outcome: str, duration: int) -> None:
         """Count a call, which `other` should have answered."""
-        counters = self._running.counters
-        self._counts[counters[name, outcome]] += 1
-        histogram = counters["service_call_seconds", name]
-        self._counts[histogram + bisect_left(CALL_BOUNDS_NS, duration)] += 1
-        self._counts[histogram + HISTOGRAM_CELLS - 1] += duration
-        if outcome not in (ANSWERED, "cancelled"):
+        self._running.counters[name].count(self._counts, outcome, duration)
+        if is_failure(outcome):
             self._reporter.report(Report("call", name, other, outcome))
 
     def unmatched(self, plan: ServicePlan, number: int | None) -> None:
-        self._counts[self._running.counters["service_replies_unmatched", plan.name]] += 1
+        self._counts[self._running.unmatched[plan.name]] += 1
         detail = f"number {number}" if number is not None else ""
         self._reporter.report(Report("reply", plan.name, "", "unmatched", None, detail))
 

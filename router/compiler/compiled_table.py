@@ -419,6 +419,11 @@ class CompiledTable:
         return bool(self.publishers or self.subscriptions or self.gateways or self.service_labels)
 
     @property
+    def service_names(self) -> list[str]:
+        """The services that endpoints answer or call."""
+        return [*(plan.name for plan in self.services), *(plan.name for plan in self.called)]
+
+    @property
     def service_labels(self) -> list[str]:
         """What stands for services in place of topics."""
         return [*(plan.label for plan in self.services), *(plan.label for plan in self.called)]

@@ -52,7 +52,7 @@ def open_series(program: CompiledTable) -> None:
         _open_gateway(counters, gateway)
     for state in program.states:
         _open_state(counters, state)
-    for name in [*(plan.name for plan in program.services), *(plan.name for plan in program.called)]:
+    for name in program.service_names:
         _open_each(counters, "service_calls", name, last=CALL_OUTCOMES)
         _open(counters, _OF_SERVICES, name)
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import os
-from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.carrier.limits import RateLimit
+from router.compiler.call_counters import CallCounters, is_failure
 from router.compiler.compiled_table import ANSWERED, CALL_FAILURES, ClientCallPlan, GatewayPlan
-from router.compiler.metrics import CALL_BOUNDS_NS, CALL_OUTCOMES, HISTOGRAM_CELLS, Counters, Report
+from router.compiler.metrics import Counters, Report
 from router.gateway.context import Tasks
 from router.gateway.documents import CallRequest, no_response_document, response_document
 from router.gateway.encoding import LARGE
@@ -53,9 +53,7 @@ class _Service:
         self.max_rate = plan.settings.max_rate
         self.may_pass = RateLimit(outputs.library, self.max_rate).may_pass if self.max_rate is not None else None
         self.decode, self.encode = decoder(plan.request, Style.PLAIN), encoder(plan.response, Style.PLAIN)
-        self.ended = {outcome: counters.index("service_calls", plan.name, outcome) for outcome in CALL_OUTCOMES}
-        self.is_open = counters.index("service_calls_open", plan.name)
-        self.seconds = counters.index("service_call_seconds", plan.name)
+        self.counters = CallCounters.of(counters, plan.name)
 
 
 class ClientCalls:
@@ -148,7 +146,7 @@ class ClientCalls:
         else:
             timer = asyncio.get_running_loop().call_later(service.timeout / 1e9, self._time_out, service, number)
             service.open[number] = _Call(client, request.id, number, now, timer)
-            self._counts[service.is_open] = len(service.open)
+            self._counts[service.counters.open] = len(service.open)
 
     def _take(self) -> None:
         with suppress(BlockingIOError):
@@ -194,7 +192,7 @@ class ClientCalls:
     def _close_call(self, service: _Service, call: _Call, outcome: str, detail: str = "") -> None:
         call.timer.cancel()
         del service.open[call.number]
-        self._counts[service.is_open] = len(service.open)
+        self._counts[service.counters.open] = len(service.open)
         self._count(service, outcome, self._outputs.clock_ns() - call.began, detail)
 
     def _refuse(self, service: _Service, client: Client, request: CallRequest, outcome: str, detail: str = "") -> None:
@@ -203,10 +201,8 @@ class ClientCalls:
         self._respond(client, no_response_document(request.id, detail or _reason(service, outcome)))
 
     def _count(self, service: _Service, outcome: str, took: int, detail: str) -> None:
-        self._counts[service.ended[outcome]] += 1
-        self._counts[service.seconds + bisect_left(CALL_BOUNDS_NS, took)] += 1
-        self._counts[service.seconds + HISTOGRAM_CELLS - 1] += took
-        if outcome not in (ANSWERED, "cancelled"):
+        service.counters.count(self._counts, outcome, took)
+        if is_failure(outcome):
             plan = service.plan
             self._outputs.report(Report("call", plan.name, plan.label, outcome, None, detail))
 
