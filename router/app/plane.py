@@ -192,7 +192,7 @@ class Plane:
             waiting = change.before.topic_change()
         if change.is_same is False:
             self._programs = {}  # they would not explain its events
-        if change.program.publishers or change.program.service_labels:
+        if change.program.publishers or change.program.service_names:
             self._publishing.start(_functions_of_rcl(self.library), waiting)
         for thread in self._from_ros:
             if change.routes.only(urgent=thread.is_urgent).topics:

@@ -416,17 +416,12 @@ class CompiledTable:
     @property
     def uses_ros(self) -> bool:
         """Whether it needs a ROS node."""
-        return bool(self.publishers or self.subscriptions or self.gateways or self.service_labels)
+        return bool(self.publishers or self.subscriptions or self.gateways or self.service_names)
 
     @property
     def service_names(self) -> list[str]:
         """The services that endpoints answer or call."""
         return [*(plan.name for plan in self.services), *(plan.name for plan in self.called)]
-
-    @property
-    def service_labels(self) -> list[str]:
-        """What stands for services in place of topics."""
-        return [*(plan.label for plan in self.services), *(plan.label for plan in self.called)]
 
     @property
     def client_calls(self) -> list[ClientCallPlan]:
@@ -436,7 +431,7 @@ class CompiledTable:
     @property
     def request_labels(self) -> list[str]:
         """What stands for services as the source of messages."""
-        return [*self.service_labels, *(plan.failed for plan in self.called)]
+        return [*map(service_label, self.service_names), *(plan.failed for plan in self.called)]
 
     @property
     def client_deadmen(self) -> list[DeadmanPlan]:

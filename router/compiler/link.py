@@ -5,7 +5,7 @@ Expects a table without errors and checks nothing.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from router.compiler.checked import (
@@ -26,6 +26,7 @@ from router.compiler.compiled_table import (
     ServicePlan,
     StatePlan,
     TopicPlan,
+    is_service,
 )
 from router.compiler.lookup import definitions_of
 from router.compiler.lowering import Lowered
@@ -69,17 +70,16 @@ def link(checked: Checked, counters: Counters) -> CompiledTable | None:
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     services = tuple(map(_service, checked.services))
     called = tuple(map(_called, checked.called))
-    labels = {*(plan.label for plan in services), *(name for plan in called for name in (plan.label, plan.failed))}
     program = CompiledTable(
         table=table,
         envelopes=envelopes,
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
-        publishers=_topics([*_published(served, labels), *checked.own_topics], _published_by_clients(checked.gateways)),
+        publishers=_topics([*_published(served), *checked.own_topics], _published_by_clients(checked.gateways)),
         subscriptions=_topics(
             (feed.topic, feed.type)
             for feed in [*_feeds(served), *_feeds_of_states(checked)]
-            if feed.topic.topic.value not in labels
+            if not is_service(feed.topic.topic.value)
         ),
         inbound=inbound,
         outbound=outbound,
@@ -161,11 +161,11 @@ def _feeds_of_states(checked: Checked) -> Iterator[CheckedSubscription]:
     yield from (state.feed for state in checked.states.values() if state.feed is not None)
 
 
-def _published(routes: Iterable[CheckedRoute], services: Container[str]) -> Iterator[tuple[Topic, MessageType]]:
+def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
     """Yield the topics that routes publish on, without targets that are services."""
     for checked in routes:
         for used in checked.targets:
-            if used.topic and used.type and used.label not in services:
+            if used.topic and used.type and not is_service(used.label):
                 yield used.topic, used.type
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 from router.compiler.compiled_table import (
     STRANGER,
@@ -11,6 +11,7 @@ from router.compiler.compiled_table import (
     GatewayPlan,
     RoutePlan,
     StatePlan,
+    is_service,
     source_label,
 )
 from router.compiler.metrics import (
@@ -43,9 +44,8 @@ def open_series(program: CompiledTable) -> None:
     counters, table = program.counters, program.table
     _open_listeners(counters, table, program.envelopes)
     _open_own(counters, table)
-    services = program.request_labels
     for plan in program.routes:
-        _open_route(counters, table, plan, services)
+        _open_route(counters, table, plan)
     for deadman in program.deadmen:
         _open_deadman(counters, deadman)
     for gateway in program.gateways:
@@ -109,13 +109,13 @@ def _open_own(counters: Counters, table: RouteTable) -> None:
 _OF_SERVICES = "service_calls_open", "service_call_seconds", "service_retries", "service_replies_unmatched"
 
 
-def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan, services: Collection[str]) -> None:
-    """Open the series of a route, or of one source topic of a route from ROS. `services` are no topics."""
+def _open_route(counters: Counters, table: RouteTable, plan: RoutePlan) -> None:
+    """Open the series of a route, or of one source topic of a route from ROS."""
     route = plan.route
     _open(counters, ("route_duration_seconds", "route_silence_seconds"), route)
     published = [target.label for target in plan.targets if target.is_topic]
     topics = published if plan.topic is None else [plan.topic]
-    for topic in (name for name in topics if name not in services):
+    for topic in (name for name in topics if not is_service(name)):
         _open_each(counters, "qos_incompatible", route, topic, last=QOS_POLICIES)
     if plan.topic is None:
         sources = [source for source in (*table.endpoints, STRANGER) if source in plan.sources]

@@ -9,7 +9,15 @@ from typing import Any
 
 from router import declared as c
 from router.compiler.checked import Target
-from router.compiler.compiled_table import STRANGER, Beside, CompiledTable, RoutePlan, StatePlan, source_label
+from router.compiler.compiled_table import (
+    STRANGER,
+    Beside,
+    CompiledTable,
+    RoutePlan,
+    StatePlan,
+    is_service,
+    source_label,
+)
 from router.compiler.lowering import LoweredCollect, LoweredElements, LoweredRoute
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.lowering.layout import Layout
@@ -215,8 +223,7 @@ class TargetWriter:
 
     def _topic(self, topic: str) -> c.Target:
         if topic not in self._topics:
-            is_service = topic in self.program.service_labels
-            self._topics[topic] = self.arrays.add(self._service() if is_service else self._published(topic))
+            self._topics[topic] = self.arrays.add(self._service() if is_service(topic) else self._published(topic))
         return c.Target(topic=ctypes.pointer(self._topics[topic]))
 
     def _published(self, topic: str) -> c.Topic:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from router import declared as c
-from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, RoutePlan, source_label
+from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan, RoutePlan, is_service, source_label
 from router.compiler.lowering import LoweredFeed
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
@@ -44,7 +44,6 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
     columns = {name: column for column, name in enumerate(program.table.endpoints)}
     structure = arrays.add(_Writer(program, targets, numbers, columns).program_of(plans))
     ros = {topic: _ros_routes(targets, topic, feeds) for topic, feeds in program.lowered.from_ros.items()}
-    services = program.request_labels
     for client_deadman in program.client_deadmen:
         openings.client_deadman(client_deadman)
     memory = Memory(arrays)
@@ -57,9 +56,9 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
         ros_topics=[
             (topic, memory.offset(ctypes.addressof(routes)), len(routes), any(feed.is_urgent for feed in feeds))
             for (topic, feeds), routes in zip(program.lowered.from_ros.items(), ros.values(), strict=True)
-            if topic not in services
+            if not is_service(topic)
         ],
-        requests=[(label, memory.offset(ctypes.addressof(ros[label]))) for label in services],
+        requests=[(label, memory.offset(ctypes.addressof(ros[label]))) for label in program.request_labels],
         listeners=[
             (each.name, tuple(each.address.value), each.interface, each.receive_buffer, each.group_hosts)
             for each in program.table.sockets

@@ -12,7 +12,7 @@ from functools import cached_property
 
 from router.compiler import Checked
 from router.compiler.checked import CheckedCalled, CheckedService
-from router.compiler.compiled_table import CompiledTable, StatePlan, service_label
+from router.compiler.compiled_table import CompiledTable, StatePlan, is_service, service_label
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.network import sent_by
@@ -218,7 +218,7 @@ class Names:
 
     def published(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
         """Return a topic with its type."""
-        topics = [topic for topic in self._published if topic not in self._labels]
+        topics = [topic for topic in self._published if not is_service(topic)]
         return self._known(name, topics, span, "route that publishes on"), self._published[name]
 
     def subscribed(self, name: str, span: SourceSpan) -> tuple[str, MessageType]:
@@ -272,12 +272,7 @@ class Names:
         subscriptions = [subscription for route in self._checked.routes for subscription in route.subscriptions]
         subscriptions += [state.feed for state in self._checked.states.values() if state.feed is not None]
         types = {subscription.topic.topic.value: subscription.type for subscription in subscriptions}
-        of_services = {*self._labels, *(plan.failed for plan in self._program.called)}
-        return {topic: kind for topic, kind in types.items() if topic not in of_services}
-
-    @cached_property
-    def _labels(self) -> Collection[str]:
-        return {*(plan.label for plan in self._program.services), *(plan.label for plan in self._program.called)}
+        return {topic: kind for topic, kind in types.items() if not is_service(topic)}
 
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)
