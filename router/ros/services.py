@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from itertools import islice
+from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -24,6 +25,9 @@ MOST_WAITING = 1000
 """Requests that wait to be taken, and responses that wait for their clients, of all clients together. ROS keeps 10 by
 default, and loses the others without a word.
 """
+
+LINGER_S = 0.2
+"""How long a service stays open after a response, in seconds: a client that has not taken it by then may lose it."""
 
 _set_callback = RCL.rcl_service_set_on_new_request_callback
 _set_callback_of_client = RCL.rcl_client_set_on_new_response_callback
@@ -53,6 +57,7 @@ class ServedService:
         self.plan = plan
         self._node = node
         self._type = service_class(plan.type_name, plan.definitions, plan.span)
+        self._answered_at = -LINGER_S
         try:
             self._service = node.create_service(
                 self._type,
@@ -85,8 +90,11 @@ class ServedService:
     def answer(self, request: Request, response: bytes) -> None:
         """Send a response. Raises one of RCL_ERRORS."""
         self._service.send_response(deserialize_message(response, self._type.Response), request.header)
+        self._answered_at = monotonic()
 
     def close(self) -> None:
+        """Close it, after clients have had time to take the last response."""
+        sleep(max(0.0, self._answered_at + LINGER_S - monotonic()))
         _set_callback(self._service.handle.pointer, None, None)
         self._node.destroy_service(self._service)
 

@@ -294,6 +294,8 @@ def test_calls_that_wait_when_their_service_ends_are_answered(link: Link, how: s
         link.router.process.send_signal(how)
     text = "the router has reloaded its table, or stops"
     assert [response.get(timeout=30)["message"] for response in responses] == [text] * (4 * TYPICAL)
+    if how == signal.SIGTERM:
+        assert link.router.wait() == 0
 
 
 def test_a_board_that_is_gone_ends_calls_at_once(link: Link) -> None:
