@@ -45,6 +45,11 @@ def function(name: str, returned: Any, *taken: Any) -> Any:
     return ctypes.CFUNCTYPE(returned, *taken)((name, RCL))
 
 
+def callback_setter(name: str) -> Any:
+    """Return a function of rcl that sets who is called for new messages: (handle, callback, user data)."""
+    return function(name, c_int, c_void_p, c_void_p, c_void_p)
+
+
 class PublishFunctions(NamedTuple):
     """Addresses of the functions that publish CDR bytes, return the error, and reset it."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import select
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -16,18 +16,42 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 
 from router.clock import wall_ns
-from router.ros.rcl import RCL, address
+from router.ros.rcl import address, callback_setter
 
 MOST_KEPT = 5000
 """Messages that a subscription without a depth holds: the default of Fast DDS."""
 
-_set_callback = RCL.rcl_subscription_set_on_new_message_callback
-_set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+_set_callback = callback_setter("rcl_subscription_set_on_new_message_callback")
 
 # The middleware calls `void callback(const void *user_data, size_t messages)`; where arguments are passed in registers,
 # libc's `int eventfd_write(int fd, uint64_t value)` can be that callback, with the descriptor as user data.
-ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
-"""The callback that adds the number of new messages or requests to an eventfd."""
+_ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+"""The callback that adds the number of new messages to an eventfd."""
+
+
+def announce(set_callback: Callable[..., int], handle: Any, eventfd: int | None, what: str = "messages") -> None:
+    """Have the middleware add the number of new messages of a handle to `eventfd`, or to none. `what` they are.
+
+    `set_callback` is the `callback_setter` for this kind of handle. A thread of the middleware calls back while it
+    holds the reader's lock. No Python code may run there: it would wait for the interpreter lock while the thread that
+    holds it waits for the reader's lock, to take a message. When this returns, the previous eventfd is no longer used.
+    Raises one of `RCL_ERRORS`.
+    """
+    callback = None if eventfd is None else _ADD_TO_EVENTFD
+    # rmw_fastrtps counts waiting messages, then begins to listen: only a second call counts those in between.
+    for _ in range(1 if eventfd is None else 2):
+        if set_callback(handle.pointer, callback, eventfd):
+            raise rclpy_implementation.RCLError(f"the middleware does not report new {what}")
+
+
+def sent_at(sent: int, received: int) -> int:
+    """Return when a message was sent, in ns of the wall clock; a time that the middleware does not know is 0.
+
+    That is the sender's time stamp, or our time of receipt if that is earlier. The time of receipt alone would make old
+    messages look new: reliable DDS repairs a loss seconds later and keeps messages for late joiners, and a process that
+    was stopped receives everything sent meanwhile at once.
+    """
+    return min(sent or received, received or sent) or wall_ns()
 
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of the functions with which a native thread takes messages and resets errors."""
@@ -67,35 +91,20 @@ class RawSubscription:
         return int(self.handle.pointer)
 
     def take(self) -> tuple[bytes, int] | None:
-        """Return the oldest message and its time of sending, in ns of the wall clock; None if there is no message.
-
-        That is the sender's time stamp, or our time of receipt if that is earlier. The time of receipt
-        alone would make old messages look new: reliable DDS repairs a loss seconds later and keeps messages for late
-        joiners, and a process that was stopped receives everything sent meanwhile at once.
-        """
+        """Return the oldest message and its time of sending (see `sent_at`); None if there is no message."""
         taken = self.handle.take_message(self._message_class, True)
         if taken is None:
             return None
         cdr, info = taken
-        sent, received = info["source_timestamp"], info["received_timestamp"]  # 0 if unknown to the middleware
-        return cdr, min(sent or received, received or sent) or wall_ns()
+        return cdr, sent_at(info["source_timestamp"], info["received_timestamp"])
 
     def take_all(self) -> list[tuple[bytes, int]]:
         """Return the messages that have arrived, at most `capacity`, even if more keep arriving."""
         return [message for _ in range(self.capacity) if (message := self.take())]
 
     def announce_to(self, eventfd: int | None) -> None:
-        """Have the middleware add the number of new messages to `eventfd`, or to none.
-
-        A thread of the middleware does that while it holds the reader's lock. No Python code may run there: it would
-        wait for the interpreter lock while the thread that holds it waits for the reader's lock, to take a message.
-        When this returns, the previous eventfd is no longer used. Raises one of `RCL_ERRORS`.
-        """
-        callback = None if eventfd is None else ADD_TO_EVENTFD
-        # rmw_fastrtps counts waiting messages, then begins to listen: only a second call counts those in between.
-        for _ in range(1 if eventfd is None else 2):
-            if _set_callback(self.handle.pointer, callback, eventfd):
-                raise rclpy_implementation.RCLError("the middleware does not report new messages")
+        """Have the middleware add the number of new messages to `eventfd`, or to none. Raises one of `RCL_ERRORS`."""
+        announce(_set_callback, self.handle, eventfd)
 
     def close(self) -> None:
         """Close the subscription, when it announces to no eventfd and no thread takes from it."""

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
 from itertools import islice
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
-from router.clock import wall_ns
 from router.compiler.compiled_table import CalledPlan, ClientCallPlan, ServicePlan
 from router.ros.node import RCL_ERRORS, start_error
-from router.ros.rcl import RCL
-from router.ros.receiving import ADD_TO_EVENTFD
+from router.ros.rcl import callback_setter
+from router.ros.receiving import announce, sent_at
 from router.ros.types import service_class
 
 MOST_WAITING = 1000
@@ -29,9 +26,8 @@ default, and loses the others without a word.
 LINGER_S = 0.2
 """How long a service stays open after a response, in seconds: a client that has not taken it by then may lose it."""
 
-_set_callback = RCL.rcl_service_set_on_new_request_callback
-_set_callback_of_client = RCL.rcl_client_set_on_new_response_callback
-_set_callback.argtypes = _set_callback_of_client.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+_set_callback = callback_setter("rcl_service_set_on_new_request_callback")
+_set_callback_of_client = callback_setter("rcl_client_set_on_new_response_callback")
 
 
 class Request(NamedTuple):
@@ -66,9 +62,7 @@ class ServedService:
                 qos_profile=QoSProfile(depth=MOST_WAITING),
                 callback_group=ReentrantCallbackGroup(),  # the node's own group would leak memory
             )
-            for _ in range(2):  # see RawSubscription.announce_to
-                if _set_callback(self._service.handle.pointer, ADD_TO_EVENTFD, eventfd):
-                    raise rclpy_implementation.RCLError("the middleware does not report new requests")
+            announce(_set_callback, self._service.handle, eventfd, "requests")
         except RCL_ERRORS as error:
             raise start_error(error, f"{plan.span}: service '{plan.name}' cannot be opened: {error}") from error
 
@@ -79,9 +73,7 @@ class ServedService:
             request, header = handle.service_take_request(self._type.Request)
         if request is None:
             return None
-        sent, received = header.source_timestamp, header.received_timestamp  # 0 if unknown to the middleware
-        called_at = min(sent or received, received or sent) or wall_ns()
-        return Request(serialize_message(request), header, called_at)
+        return Request(serialize_message(request), header, sent_at(header.source_timestamp, header.received_timestamp))
 
     def waiting(self) -> Iterator[Request]:
         """Take the requests that wait, not those that clients go on to send. Raises one of RCL_ERRORS."""
@@ -114,9 +106,7 @@ class CallingClient:
                 qos_profile=QoSProfile(depth=MOST_WAITING),
                 callback_group=ReentrantCallbackGroup(),
             )
-            for _ in range(2):
-                if _set_callback_of_client(self._client.handle.pointer, ADD_TO_EVENTFD, eventfd):
-                    raise rclpy_implementation.RCLError("the middleware does not report new responses")
+            announce(_set_callback_of_client, self._client.handle, eventfd, "responses")
         except RCL_ERRORS as error:
             raise start_error(error, f"{plan.span}: service '{plan.service}' cannot be called: {error}") from error
 
