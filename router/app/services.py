@@ -10,7 +10,7 @@ import os
 import select
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import RLock
 from typing import TYPE_CHECKING, TypeVar
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from router.carrier.events import Reply
     from router.compiler.compiled_table import CompiledTable
     from router.observe.reports import Reporter
+    from router.ros.router_node import RouterNode
     from router.ros.services import CallingClient, Request, ServedService
 
 T = TypeVar("T")
@@ -51,9 +52,9 @@ _TURN = 32
 class ServiceChange:
     """All services and clients of the next program by name, the newly opened ones, and the unused old ones."""
 
-    served: dict[str, ServedService]
-    calling: dict[str, CallingClient]
-    opened: list[ServedService | CallingClient]
+    served: dict[str, ServedService] = field(default_factory=dict)
+    calling: dict[str, CallingClient] = field(default_factory=dict)
+    opened: list[ServedService | CallingClient] = field(default_factory=list)
     unused: list[ServedService | CallingClient] = field(default_factory=list)
 
 
@@ -107,27 +108,31 @@ class Services:
         """Open the services that are not open yet. Raises StartError, or StuckError if the thread is stuck."""
         self._acquire()
         self._lock.release()
-        node, opened = self._topics.node, list["ServedService | CallingClient"]()
-        served, calling = dict[str, "ServedService"](), dict[str, "CallingClient"]()
-        with ExitStack() as undo:
-            for plan in change.program.services:
-                kept = self._served.get(plan.name)
-                if kept is None or _is_other(kept.plan, plan):
-                    assert node is not None  # noqa: S101 - opened for the services
-                    kept = node.open_service(plan, self._eventfd)
-                    opened.append(kept)
-                    undo.callback(kept.close)
-                served[plan.name] = kept
-            for called in change.program.called:
-                client = self._calling.get(called.name)
-                if client is None or _is_other(client.plan, called):
-                    assert node is not None  # noqa: S101 - likewise
-                    client = node.open_client(called, self._eventfd)
-                    opened.append(client)
-                    undo.callback(client.close)
-                calling[called.name] = client
-            undo.pop_all()
-        change.services = ServiceChange(served, calling, opened)
+        change.services = ServiceChange()
+        try:
+            self._open(change.services, change.program)
+        except BaseException:
+            self.undo(change)
+            raise
+
+    def _open(self, change: ServiceChange, program: CompiledTable) -> None:
+        for plan in program.services:
+            kept = self._served.get(plan.name)
+            if kept is None or _is_other(kept.plan, plan):
+                kept = self._node.open_service(plan, self._eventfd)
+                change.opened.append(kept)
+            change.served[plan.name] = kept
+        for called in program.called:
+            client = self._calling.get(called.name)
+            if client is None or _is_other(client.plan, called):
+                client = self._node.open_client(called, self._eventfd)
+                change.opened.append(client)
+            change.calling[called.name] = client
+
+    @property
+    def _node(self) -> RouterNode:
+        assert self._topics.node is not None  # noqa: S101 - opened for the services
+        return self._topics.node
 
     def undo(self, change: Change) -> None:
         """Close the services that `prepare` has opened."""
