@@ -27,6 +27,9 @@ _PIPE = 1 << 20
 """Bytes that a child can print before the test reads: a blocked child loses messages."""
 
 
+_PATIENCE = 60
+
+
 class ForkedProcess:
     """A child of the forker, with the part of `subprocess.Popen`'s interface that tests use."""
 
@@ -83,10 +86,20 @@ class RosProcess:
 
     def __init__(self, script: str, *arguments: str) -> None:
         self.process = ForkedProcess(script, *arguments)
+        self._rest = b""
 
     def line(self) -> str:
-        """Wait for the child's next line and return it."""
-        return self.process.stdout.readline().strip()
+        """Wait for the child's next line and return it; "" at the end of its output."""
+        from tests.readable import readable  # as above
+
+        descriptor = self.process.stdout.fileno()
+        while b"\n" not in self._rest:
+            assert readable(descriptor, _PATIENCE), f"the child has said nothing for {_PATIENCE} s"
+            if not (piece := os.read(descriptor, _PIPE)):
+                break
+            self._rest += piece
+        line, _, self._rest = self._rest.partition(b"\n")
+        return line.decode().strip()
 
     def kill(self) -> None:
         """Kill the child with SIGKILL, so that it does not announce its end to ROS."""

@@ -234,7 +234,7 @@ routes:
 """
     with running(tmp_path, routes) as (place, router), hearing(place, "killed_a") as (stays,):
         before = place.scrape()
-        with sending(place, imu) as sent:
+        with sending(place, imu, period=0.01) as sent:
             for _ in range(3):
                 killed = [Subscriber(topic, FLOAT, *how) for topic in ("killed_a", "killed_b") for how in _RELIABILITY]
                 for each in killed:
