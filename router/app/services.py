@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import select
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import RLock
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from router.app.change import Change
 from router.clock import boottime_ns, wall_ns
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from router.ros.router_node import RouterNode
     from router.ros.services import CallingClient, Request, ServedService
 
-T = TypeVar("T")
-
 _LOOK_S = 0.25
 """The longest time between two comparisons of the clocks."""
 _PATIENCE_S = 1.0
 """How long a reload waits for the thread while it may be stuck in the middleware."""
 _TURN = 32
 """Requests of one service before others are served."""
+_MOST_WAITING = 1000
+"""Responses that wait for a client: see `router.ros.services`."""
 
 
 @dataclass(slots=True)
@@ -159,7 +159,8 @@ class Services:
         if (served or calling) and self._thread is None:
             self._thread = Thread(self._run, "services")
             self._thread.start()
-        os.eventfd_write(self._eventfd, 1)
+        # What a new client has got so far may have been added before.
+        os.eventfd_write(self._eventfd, _MOST_WAITING)
 
     def finish(self, change: Change) -> None:
         """Close the services that only the earlier program had."""
@@ -191,11 +192,12 @@ class Services:
         poll.register(self._eventfd, select.POLLIN)
         while not self._is_stopping:
             poll.poll(self._patience())
+            arrived = 0
             with suppress(BlockingIOError):
-                os.eventfd_read(self._eventfd)
+                arrived = os.eventfd_read(self._eventfd)
             with self._lock:
                 try:
-                    self._serve()
+                    self._serve(arrived)
                 except Exception as error:  # noqa: BLE001 a bug is logged; later calls are still served
                     fault(error, "lost a call of a service").log()
 
@@ -205,7 +207,8 @@ class Services:
         wait = (due - boottime_ns()) / 1e6 if due != NEVER else _LOOK_S * 1e3
         return max(0.0, min(wait + 1, _LOOK_S * 1e3))
 
-    def _serve(self) -> None:
+    def _serve(self, arrived: int) -> None:
+        """Take and send what has come and is due. `arrived` is what has been added to the eventfd."""
         assert self._calls is not None  # noqa: S101 - the thread runs
         assert self._asking is not None  # noqa: S101 - likewise
         self._sender.look()
@@ -214,22 +217,22 @@ class Services:
             self._calls.reply(reply.service, reply.message, boottime_ns())
             self._asking.request(reply.service, reply.message, boottime_ns())
         for client in self._calling.values():
-            for response in self._turn(client.take):
+            for response in client.take_all(arrived):
                 self._asking.response(client.plan.label, response.number, response.message, boottime_ns())
         for served in self._served.values():
-            for request in self._turn(served.take):
+            for request in self._turn(served):
                 caller = served, request
                 self._calls.call(served.plan.label, caller, request.message, request.called_at, boottime_ns())
         self._calls.serve(boottime_ns())
         self._asking.serve(boottime_ns())
         self._note_open()
 
-    def _turn(self, take: Callable[[], T | None]) -> Iterator[T]:
-        """Take what has arrived, but not too much at once."""
+    def _turn(self, served: ServedService) -> Iterator[Request]:
+        """Take the requests that wait, but not too many at once."""
         for _ in range(_TURN):
-            if (taken := take()) is None:
+            if (request := served.take()) is None:
                 return
-            yield taken
+            yield request
         os.eventfd_write(self._eventfd, 1)
 
     def _note_open(self) -> None:

@@ -149,10 +149,9 @@ class ClientCalls:
             self._counts[service.counters.open] = len(service.open)
 
     def _take(self) -> None:
-        with suppress(BlockingIOError):
-            os.eventfd_read(self._eventfd)
+        arrived = os.eventfd_read(self._eventfd)
         for service in self._services.values():
-            for response in _responses(service.ros, service.plan) if service.ros is not None else ():
+            for response in _responses(service.ros, service.plan, arrived) if service.ros is not None else ():
                 if (call := service.open.get(response.number)) is not None:  # it may have timed out
                     self._answer(service, call, response.message)
 
@@ -216,9 +215,9 @@ def _ask(ros: CallingClient, plan: ClientCallPlan, cdr: bytes) -> int | None:
         return None
 
 
-def _responses(ros: CallingClient, plan: ClientCallPlan) -> Iterator[Response]:
+def _responses(ros: CallingClient, plan: ClientCallPlan, arrived: int) -> Iterator[Response]:
     try:
-        yield from iter(ros.take, None)
+        yield from ros.take_all(arrived)
     except RuntimeError as error:  # of rcl
         logger.warning("responses of a service are lost", service=plan.name, problem=str(error))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
+from itertools import count, islice
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
@@ -119,8 +119,20 @@ class CallingClient:
             number: int = handle.send_request(deserialize_message(request, self._type.Request))
         return number
 
-    def take(self) -> Response | None:
-        """Return the oldest response; None if there is none. Raises one of RCL_ERRORS."""
+    def take_all(self, arrived: int) -> Iterator[Response]:
+        """Take the responses that have arrived. `arrived` is what the eventfd has had added since the last call.
+
+        The middleware gives each client the responses to all clients of the service. A take that removes another
+        client's returns nothing, although more may wait, so at least `arrived` takes are made. Raises one of
+        RCL_ERRORS.
+        """
+        for takes in count(1):
+            if (response := self._take()) is not None:
+                yield response
+            elif takes >= arrived:
+                return
+
+    def _take(self) -> Response | None:
         handle = self._client.handle
         with handle:
             header, response = handle.take_response(self._type.Response)

@@ -15,6 +15,7 @@ import pytest
 from router.compiler import check_table
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import ROUTER
+from tests.acceptance.service_clients import Service, ServiceClients
 from tests.acceptance.service_server import ServiceServer
 from tests.acceptance.site import RouterProcess, Site, site, udp, wait_until
 
@@ -41,6 +42,7 @@ services:
     on_timeout: {{id: request.id, found: false, offset: len(reason)}}
 routes: {{}}
 """
+HOME = Service("get_home", "std_srvs/srv/SetBool")
 REQUEST = {"id": 4_000_000_000, "fast": True, "axis": 1, "speed": 1.5, "name": "a", "offset": -(1 << 40)}
 MISSING, LATE = "there is no server of get_home", "get_home did not respond within 700 ms"
 CANCELLED = "the router has reloaded its table, or stops"
@@ -128,6 +130,17 @@ def test_a_server_that_dies_in_a_call(link: Link) -> None:
         server.request()
         server.kill()
         assert link.reply() == link.failed(6, LATE)
+
+
+def test_responses_to_other_clients_delay_none(link: Link) -> None:
+    with ServiceServer("get_home") as server, ServiceClients() as others:
+        link.is_there(server)
+        with link.router.standing_still():
+            for _ in range(50):
+                assert others.call(HOME, {"data": False})["message"] == "here"
+        link.ask(id=8, fast=True)
+        assert link.reply().found
+        assert link.outcome("timed_out") == 0
 
 
 def test_many_requests_are_bounded(link: Link) -> None:

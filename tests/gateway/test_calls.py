@@ -25,6 +25,7 @@ from router.gateway import calls, encoding
 from router.gateway.clients import ClientQueue
 from router.gateway.thread import GatewayThread
 from router.library import load
+from tests.acceptance.service_clients import ARM, ServiceClients
 from tests.acceptance.service_server import ServiceServer
 from tests.gateway.stage import program
 from tests.ports import free_port
@@ -164,6 +165,14 @@ def test_a_service_without_a_server_and_a_request_without_fields(gateway: Gatewa
     assert [(report.kind, report.place, report.target, report.reason) for report in gateway.reports] == [
         ("call", "it:/nobody", "/nobody", "unsent")
     ]
+
+
+def test_responses_to_clients_of_ros_delay_none(gateway: Gateway) -> None:
+    with gateway.client() as client, served("/arm", client), ServiceClients() as others:
+        for number in range(1, 50):
+            responses = [others.begin(ARM, {"data": False}) for _ in range(8)]
+            assert all(response.get(timeout=20)["message"] == "here" for response in responses)
+            assert client.asked("/arm", number, ON)["response"]["success"]
 
 
 def test_a_late_response_is_ignored(gateway: Gateway) -> None:
