@@ -35,8 +35,8 @@ def skip_without_nanopb() -> None:
         pytest.skip("needs nanopb's library for C (libnanopb-dev)")
 
 
-def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
-    """Compile a board for the message `envelope` of the `.proto` file `header` in `folder`."""
+def compiled(folder: Path, protos: Path, header: str, envelope: str, source: str = "board.c") -> Path:
+    """Compile a board, a file beside this one, for the message `envelope` of the `.proto` file `header` in `folder`."""
     skip_without_nanopb()
     names = [path.relative_to(protos).as_posix() for path in sorted(protos.rglob("*.proto"))]
     generator = [sys.executable, "-m", "nanopb.generator.nanopb_generator", "-q", "-I", ".", "-D", str(folder)]
@@ -44,7 +44,7 @@ def compiled(folder: Path, protos: Path, header: str, envelope: str) -> Path:
     made = folder / "board"
     options = [f'-DPROTO="{Path(header).with_suffix(".pb.h")}"', f"-DENVELOPE={envelope}", f"-I{folder}"]
     options += [f"-idirafter{headers}" for headers in _HEADERS]
-    sources = [str(Path(__file__).with_suffix(".c")), *map(str, sorted(folder.rglob("*.pb.c")))]
+    sources = [str(Path(__file__).with_name(source)), *map(str, sorted(folder.rglob("*.pb.c")))]
     compile_c([*options, *sources, "-lprotobuf-nanopb", "-o", str(made)])
     return made
 
