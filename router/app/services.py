@@ -42,6 +42,7 @@ _LOOK_S = 0.25
 """The longest time between two comparisons of the clocks."""
 _PATIENCE_S = 1.0
 """How long a reload waits for the thread while it may be stuck in the middleware."""
+_MS = 1_000_000
 _TURN = 32
 """Requests of one service before others are served."""
 _MOST_WAITING = 1000
@@ -154,7 +155,8 @@ class Services:
             self._served, self._calling = served, calling
             self._running = _Running.of(program, change.image.requests())
             numbers = self._calls.numbers if self._calls is not None else {}
-            self._calls = Calls(program.services, program.envelopes, self, numbers)
+            # Numbers that begin with the time in ms are others than those before a restart.
+            self._calls = Calls(program.services, program.envelopes, self, numbers, first=wall_ns() // _MS)
             self._asking = Asking(program.called, self)
         if (served or calling) and self._thread is None:
             self._thread = Thread(self._run, "services")

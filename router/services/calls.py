@@ -64,7 +64,8 @@ class _Call(Generic[Caller]):
 class Calls(Generic[Caller]):
     """The open calls of the services of a table. Not thread-safe.
 
-    `numbers` are those of an earlier table: a late reply to one of its calls then answers no call of this one.
+    `numbers` are those of an earlier table: a late reply to one of its calls then answers no call of this one. Services
+    that had none begin after `first`.
     """
 
     def __init__(
@@ -73,13 +74,14 @@ class Calls(Generic[Caller]):
         envelopes: Envelopes,
         effects: Effects[Caller],
         numbers: Mapping[str, int] = MappingProxyType({}),
+        first: int = 0,
     ) -> None:
         self._plans = {plan.label: plan for plan in plans}
         self._envelopes = envelopes
         self._effects = effects
         self._open: list[_Call[Caller]] = []
         """The oldest call is first."""
-        self.numbers = {label: numbers.get(label, 0) for label in self._plans}
+        self.numbers = {label: numbers.get(label, first) for label in self._plans}
         """The number of the last call of each service."""
         self._groups: dict[tuple[str, str], list[str]] = {}
         for label, plan in self._plans.items():

@@ -101,6 +101,10 @@ class Link:
     def outcome(self, name: str, service: str = "arm") -> float:
         return self.place.samples()[f'service_calls_total{{outcome="{name}",service="{service}"}}']
 
+    def numbers(self) -> list[int]:
+        """The number of each request that the board has got."""
+        return [request.arm_request.id for request in self.board.requests]
+
     def unmatched(self) -> float:
         return self.place.samples()['service_replies_unmatched_total{service="arm"}']
 
@@ -130,18 +134,21 @@ def link(tmp_path: Path, clients: ServiceClients) -> Iterator[Link]:
 
 
 def test_a_board_answers_a_call(link: Link) -> None:
-    assert link.clients.call(ARM, ON) == {"success": True, "message": "1"}
-    assert link.clients.call(ARM, OFF) == {"success": False, "message": "2"}
+    answers = link.clients.call(ARM, ON), link.clients.call(ARM, OFF)
+    first, second = link.numbers()
+    assert answers == ({"success": True, "message": str(first)}, {"success": False, "message": str(second)})
+    assert second == first + 1
     assert [request.req_id for request in link.board.requests] == [1, 2]
     assert link.clients.call(SINGLE) == {"success": True, "message": ""}
     assert link.outcome("answered") == 2
-    for number in (1, 2):  # the route gets them, too
+    for number in (first, second):  # the route gets them, too
         assert link.board.envelope.FromString(link.place.receive("base")).arm_reply.id == number
 
 
 def test_the_verb_call_prints_what_the_board_answers(link: Link, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["call", "arm", "data=true", "-t", str(link.table)]) == OK
-    assert re.fullmatch(r"/arm responded in [0-9.]+ ms: success=true message=1\n", capsys.readouterr().out)
+    said = rf"/arm responded in [0-9.]+ ms: success=true message={link.numbers()[0]}\n"
+    assert re.fullmatch(said, capsys.readouterr().out)
     link.board.behave = lambda _: []
     assert main(["call", "nothing", "-t", str(link.table)]) == OK
     assert re.fullmatch(r"/nothing responded in [0-9.]+ ms: \(no fields\)\n", capsys.readouterr().out)
@@ -161,7 +168,7 @@ def test_many_calls_end_although_the_board_loses_doubles_delays_and_reorders(lin
     kept: list[Any] = []
 
     def behave(request: Any) -> Sequence[Any]:
-        number = request.arm_request.id
+        number = request.req_id
         seen[number] = seen.get(number, 0) + 1
         reply = link.board.reply(request)
         match number % 5:
@@ -181,7 +188,8 @@ def test_many_calls_end_although_the_board_loses_doubles_delays_and_reorders(lin
     responses = [link.clients.begin(ARM, ON) for _ in range(TYPICAL)]
     answers = [response.get(timeout=30) for response in responses]
     assert all(answer["success"] for answer in answers)
-    assert {int(answer["message"]) for answer in answers} == set(range(1, TYPICAL + 1))
+    assert {int(answer["message"]) for answer in answers} == set(link.numbers())
+    assert len(set(link.numbers())) == TYPICAL
     assert link.outcome("answered") == TYPICAL
     wait_until(lambda: link.unmatched() >= TYPICAL // 5, "the second replies")
     assert link.router.events("reply for a service was dropped")
@@ -254,12 +262,24 @@ def test_a_reload_ends_open_calls_and_the_next_are_answered(link: Link) -> None:
 
 def test_numbers_go_on_after_a_reload(link: Link) -> None:
     """So a late reply to a call that the reload has ended answers no other call."""
-    assert link.clients.call(ARM, ON)["message"] == "1"
+    link.clients.call(ARM, ON)
     link.table.write_text(link.table.read_text().replace("timeout: 60s", "timeout: 59s"))
     link.router.process.send_signal(signal.SIGHUP)
     wait_until(lambda: bool(link.router.events("table reloaded")), "the reload")
-    assert link.clients.call(ARM, ON)["message"] == "2"
+    link.clients.call(ARM, ON)
+    first, second = link.numbers()
+    assert second == first + 1
     assert [request.req_id for request in link.board.requests] == [1, 2]
+
+
+def test_a_restart_begins_with_other_numbers(link: Link) -> None:
+    """So a board takes no call for a retry of one before the restart, and a late reply to that one answers no other."""
+    link.clients.call(ARM, ON)
+    assert link.router.stop(signal.SIGTERM) == 0
+    with RouterProcess(link.place.folder, "-t", link.table):
+        link.clients.call(ARM, ON)
+    first, second = link.numbers()
+    assert second > first + 100  # ms, until it has started
 
 
 def test_a_reload_removes_and_adds_services(link: Link) -> None:

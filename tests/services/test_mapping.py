@@ -93,6 +93,13 @@ def test_numbers_go_on_after_a_reload(stage: Stage, program: CompiledTable) -> N
     assert stage.call("arm", "b", ARM, data=True).arm_request.id == 2
 
 
+def test_a_service_begins_with_the_number_after_the_first(stage: Stage, program: CompiledTable) -> None:
+    stage.calls = Calls(program.services, program.envelopes, stage, first=1_700_000_000_000)
+    first = stage.call("arm", "a", ARM, data=True).arm_request.id
+    assert first == 1_700_000_000_000 % (2**31 - 1) + 1
+    assert stage.call("arm", "b", ARM, data=True).arm_request.id == first + 1
+
+
 def test_a_type_without_request_fields_and_a_reply_without_number(stage: Stage) -> None:
     assert stage.call("count", "a", TRIGGER).drive.speed == 1
     stage.reply("count", log={"number": 3})
