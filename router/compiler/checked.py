@@ -121,7 +121,8 @@ class CheckedService:
     """A service whose payload cases and types exist.
 
     `ros_name` is absolute. `request` is the route of its requests. `match` are the names of the field that request and
-    reply have in common, None without. `responses` has the CDR bytes of `on_timeout` by outcome.
+    reply have in common, None without. `most` is as in ServicePlan. `responses` has the CDR bytes of `on_timeout` by
+    outcome.
     """
 
     declared: Service
@@ -131,6 +132,7 @@ class CheckedService:
     request: CheckedRoute
     reply_case: PayloadCase
     match: tuple[str, ...] | None
+    most: int
     responses: Mapping[str, bytes]
 
     @property

@@ -73,7 +73,7 @@ ANSWERED = "answered"
 """The outcome of a call with a reply."""
 
 MOST_CALLS = (1 << 31) - 1
-"""The number of the last call of a service before 1 follows: it fits each integer of protobuf."""
+"""The largest number of a call: it fits each integer of protobuf."""
 
 
 def source_label(source: str | None) -> str:
@@ -246,7 +246,7 @@ class ServicePlan:
 
     `ros_name` is absolute. `definitions` are those of request and response, as in TopicPlan. `match` are the names of
     the field that tells which call a reply answers, None if any reply does. `group` is the payload case of the replies
-    with their sender: services with the same one get the same replies.
+    with their sender: services with the same one get the same replies. After the number `most` of a call, 1 follows.
     """
 
     name: str
@@ -256,6 +256,7 @@ class ServicePlan:
     endpoint: str
     match: tuple[str, ...] | None
     group: tuple[str, str]
+    most: int
     timeout: int
     retries: int
     responses: Mapping[str, bytes]

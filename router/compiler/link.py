@@ -130,6 +130,7 @@ def _service(checked: CheckedService) -> ServicePlan:
         endpoint=declared.request.to.value,
         match=checked.match,
         group=checked.group,
+        most=checked.most,
         timeout=declared.timeout.value,
         retries=declared.retries,
         responses=checked.responses,

@@ -75,7 +75,8 @@ def _checked(lookup: Lookup, declared: Service) -> tuple[CheckedService, Target]
         return None
     path = _path(match) if match is not None else None
     name = resolved(declared.name, lookup.table.node)
-    return CheckedService(declared, name, *halves, request, reply_case, path, responses), reply
+    most = _most_calls(lookup, declared, request)
+    return CheckedService(declared, name, *halves, request, reply_case, path, most, responses), reply
 
 
 def service_type(lookup: Lookup, name: Located[str]) -> tuple[MessageType, MessageType] | None:
@@ -139,6 +140,18 @@ def feeds(
 def _sequence(numbered: MessageType, span: SourceSpan) -> Node:
     scope = Scope(numbered, (), ())
     return replace(field_of(scope.whole_message(span), numbered.fields[0], span), kind=IntKind(1, MOST_CALLS))
+
+
+def _most_calls(lookup: Lookup, declared: Service, request: CheckedRoute) -> int:
+    """Return the largest number of a call that the board can store in each field that `sequence` fills."""
+    limits, most = lookup.boards.get(declared.request.to.value), MOST_CALLS
+    if limits is None:
+        return most
+    for target in (target for feed in request.subscriptions for target in feed.targets):
+        for row in target.rows:
+            stored = limits.integers(request.case, row.target.split(".")) if row.expression == SEQUENCE else None
+            most = min(most, stored.high) if stored is not None else most
+    return most
 
 
 def _numbered(message: MessageType, number: Int) -> MessageType:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
-from router.compiler.compiled_table import ANSWERED, MOST_CALLS, ServicePlan
+from router.compiler.compiled_table import ANSWERED, ServicePlan
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import UNSENT_REASONS
 from router.types.framing import restored
@@ -168,7 +168,7 @@ class Calls(Generic[Caller]):
         return next((call for call in self._open if call.number == number and call.plan.group == plan.group), None)
 
     def _next(self, label: str) -> int:
-        self.numbers[label] = self.numbers[label] % MOST_CALLS + 1
+        self.numbers[label] = self.numbers[label] % self._plans[label].most + 1
         return self.numbers[label]
 
     def _end(self, plan: ServicePlan, caller: Caller, outcome: str, began: int, now: int) -> None:

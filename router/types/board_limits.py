@@ -103,6 +103,14 @@ class BoardLimits:
         held = self.payloads.get(case.number) or self.fields.get(tag >> 3)
         return held.message or {} if held is not None else {}
 
+    def integers(self, case: PayloadCase, path: Iterable[str]) -> Int | None:
+        """Return the integers that the firmware can store in a field of a payload, None if it stores all."""
+        fields, found = self.payload(case), None
+        for name in path:
+            found = next((each for each in fields.values() if each.descriptor.name == name), None)
+            fields = found.message or {} if found is not None else {}
+        return found.integers if found is not None else None
+
     def frame(self, number: int) -> BoardMessage:
         """Return the fields of an envelope with a payload of the case with this number, which it holds as bytes."""
         held = self.payloads[number]

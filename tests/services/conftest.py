@@ -9,9 +9,10 @@ import pytest
 from router.compiler import check_table
 from router.compiler.compiled_table import CompiledTable
 
+PROTOS = Path(__file__).parents[1] / "bad_tables/protos/calls"
 TABLE = """\
 version: 1
-envelope: {protos: ROOT/bad_tables/protos/calls, message: PBEnvelope, oneof: payload}
+envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
 listen: {rover: {address: 127.0.0.1:5000}}
 endpoints: {arm_board: {address: 127.0.0.40:8, kind: board, set: {req_id: sequence}}}
 services:
@@ -46,8 +47,13 @@ routes: {}
 
 @pytest.fixture(scope="session")
 def program(tmp_path_factory: pytest.TempPathFactory) -> CompiledTable:
-    path = tmp_path_factory.mktemp("services") / "table.yaml"
-    path.write_text(TABLE.replace("ROOT", str(Path(__file__).parents[1])))
+    return compiled(tmp_path_factory.mktemp("services"), PROTOS)
+
+
+def compiled(folder: Path, protos: Path) -> CompiledTable:
+    """Compile the table, which is written to `folder`."""
+    path = folder / "table.yaml"
+    path.write_text(TABLE.replace("PROTOS", str(protos)))
     checked = check_table(path, {})
     assert checked.program is not None, "\n".join(map(str, checked.diagnostics))
     return checked.program

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +16,8 @@ from router.rehearsal.cdr import deserialize, serialize
 from router.services.calls import Calls, number_in
 from router.types.ros import ros_interfaces
 from tests.carrier.simulated import START, Simulated
+from tests.services.conftest import PROTOS, compiled
 
-CALLS = Path(__file__).parents[1] / "bad_tables/protos/calls"
 BOARD = ("127.0.0.40", 8)
 INTERFACES = ros_interfaces()
 
@@ -100,6 +101,17 @@ def test_a_service_begins_with_the_number_after_the_first(stage: Stage, program:
     assert stage.call("arm", "b", ARM, data=True).arm_request.id == first + 1
 
 
+@pytest.mark.parametrize(("size", "most"), [(8, 255), (16, 65535), (32, 2**31 - 1)])
+def test_numbers_begin_again_where_the_board_stores_no_more(tmp_path: Path, size: int, most: int) -> None:
+    protos = tmp_path / "protos"
+    shutil.copytree(PROTOS, protos)
+    (protos / "envelope.options").write_text(f"ArmRequest.id int_size:{size}\n")
+    program = compiled(tmp_path, protos)
+    stage = Stage(program)
+    stage.calls = Calls(program.services, program.envelopes, stage, first=most - 1)
+    assert [stage.call("arm", "a", ARM, data=True).arm_request.id for _ in range(3)] == [most, 1, 2]
+
+
 def test_a_type_without_request_fields_and_a_reply_without_number(stage: Stage) -> None:
     assert stage.call("count", "a", TRIGGER).drive.speed == 1
     stage.reply("count", log={"number": 3})
@@ -133,7 +145,7 @@ def test_the_example_of_the_reference_is_a_table(tmp_path: Path) -> None:
     found = re.search(r"^## Services\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert found is not None
     table = tmp_path / "table.yaml"
-    head = f"version: 1\nenvelope: {{protos: {CALLS}, message: PBEnvelope, oneof: payload}}\n"
+    head = f"version: 1\nenvelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}\n"
     others = "listen: {rover: {address: 192.168.0.1:5000}}\nroutes: {drive: {ignore: no use}, log: {ignore: no use}}\n"
     table.write_text(head + found[1] + others)
     assert list(map(str, check_table(table, {}).diagnostics)) == []
