@@ -51,12 +51,13 @@ _MOST_WAITING = 1000
 
 @dataclass(slots=True)
 class ServiceChange:
-    """All services and clients of the next program by name, the newly opened ones, and the unused old ones."""
+    """All services and clients of the next program by name, the newly opened ones, and the old ones that it lacks."""
 
     served: dict[str, ServedService] = field(default_factory=dict)
     calling: dict[str, CallingClient] = field(default_factory=dict)
     opened: list[ServedService | CallingClient] = field(default_factory=list)
-    unused: list[ServedService | CallingClient] = field(default_factory=list)
+    ending: list[ServedService] = field(default_factory=list)
+    unused: list[CallingClient] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +150,8 @@ class Services:
         with self._lock:
             ending = [each for name, each in self._served.items() if served.get(name) is not each]
             self._end(ending)
-            unused: list[ServedService | CallingClient] = [*ending]
-            unused += [each for name, each in self._calling.items() if calling.get(name) is not each]
-            change.services.unused = unused
+            change.services.ending = ending
+            change.services.unused = [each for name, each in self._calling.items() if calling.get(name) is not each]
             self._served, self._calling = served, calling
             self._running = _Running.of(program, change.image.requests())
             numbers = self._calls.numbers if self._calls is not None else {}
@@ -166,7 +166,11 @@ class Services:
 
     def finish(self, change: Change) -> None:
         """Close the services that only the earlier program had."""
-        for unused in change.services.unused if change.services else ():
+        if change.services is None:
+            return
+        if change.services.ending:
+            self._node.close_services(change.services.ending)
+        for unused in change.services.unused:
             unused.close()
 
     def _end(self, ending: Iterable[ServedService]) -> None:
@@ -299,8 +303,8 @@ class Services:
             self._topics.leave_open()
             return
         self._end(self._served.values())
-        for served in self._served.values():
-            served.close()
+        if self._served:
+            self._node.close_services(self._served.values())
         for client in self._calling.values():
             client.close()
         self._sender.close()

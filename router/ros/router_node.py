@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 
@@ -16,7 +16,7 @@ from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJ
 from router.ros.graph import GraphWatch, Ours, Surroundings
 from router.ros.marks import Mark
 from router.ros.node import close_node, open_node
-from router.ros.services import CallingClient, ServedService
+from router.ros.services import CallingClient, ServedService, close_services
 from router.ros.topics import RosTopics
 from router.table.model.settings import NodeSettings
 
@@ -115,6 +115,10 @@ class RouterNode:
     def open_client(self, plan: CalledPlan | ClientCallPlan, eventfd: int) -> CallingClient:
         """Open a client of a service whose responses add to `eventfd`, likewise."""
         return CallingClient(self._node, plan, eventfd)
+
+    def close_services(self, services: Collection[ServedService]) -> None:
+        """Close services, after clients have had time to take the last response. Calls until then are cancelled."""
+        close_services(services)
 
     def undo(self, change: RosChange) -> None:
         """Close the endpoints that `prepare` has opened."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import count, islice
 from time import monotonic, sleep
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from router.compiler.compiled_table import CalledPlan, ClientCallPlan, ServicePlan
+from router.log import logger
 from router.ros.node import RCL_ERRORS, start_error
 from router.ros.rcl import callback_setter
 from router.ros.receiving import announce, sent_at
@@ -25,6 +26,8 @@ default, and loses the others without a word.
 
 LINGER_S = 0.2
 """How long a service stays open after a response, in seconds: a client that has not taken it by then may lose it."""
+_LOOK_S = 0.01
+"""How often it looks for calls meanwhile, in seconds."""
 
 _set_callback = callback_setter("rcl_service_set_on_new_request_callback")
 _set_callback_of_client = callback_setter("rcl_client_set_on_new_response_callback")
@@ -53,7 +56,7 @@ class ServedService:
         self.plan = plan
         self._node = node
         self._type = service_class(plan.type_name, plan.definitions, plan.span)
-        self._answered_at = -LINGER_S
+        self.answered_at = -LINGER_S
         try:
             self._service = node.create_service(
                 self._type,
@@ -82,13 +85,37 @@ class ServedService:
     def answer(self, request: Request, response: bytes) -> None:
         """Send a response. Raises one of RCL_ERRORS."""
         self._service.send_response(deserialize_message(response, self._type.Response), request.header)
-        self._answered_at = monotonic()
+        self.answered_at = monotonic()
+
+    def cancel_waiting(self) -> None:
+        """Answer the requests that wait as cancelled."""
+        cancelled = 0
+        try:
+            for request in self.waiting():
+                self.answer(request, self.plan.responses["cancelled"])
+                cancelled += 1
+        except RuntimeError as error:  # of rcl
+            logger.warning("calls that waited are lost", service=self.plan.name, problem=str(error))
+        if cancelled:
+            logger.info("calls were cancelled, because their service closes", service=self.plan.name, calls=cancelled)
 
     def close(self) -> None:
-        """Close it, after clients have had time to take the last response."""
-        sleep(max(0.0, self._answered_at + LINGER_S - monotonic()))
+        """Close it at once: see `close_services`."""
         _set_callback(self._service.handle.pointer, None, None)
         self._node.destroy_service(self._service)
+
+
+def close_services(services: Collection[ServedService]) -> None:
+    """Close services, after clients have had time to take the last response. Calls until then are cancelled."""
+    for each in services:
+        each.cancel_waiting()
+    until = max((each.answered_at for each in services), default=0.0) + LINGER_S
+    while monotonic() < until:
+        sleep(_LOOK_S)
+        for each in services:
+            each.cancel_waiting()
+    for each in services:
+        each.close()
 
 
 class CallingClient:

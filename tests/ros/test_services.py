@@ -1,9 +1,11 @@
-"""Clients of services that other clients call, too."""
+"""Clients of services that other clients call, too, and services that close while clients call."""
 
 from __future__ import annotations
 
 import os
+import threading
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -12,13 +14,15 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from rclpy.serialization import serialize_message
 from std_srvs.srv import SetBool  # type: ignore[import-untyped]
 
-from router.compiler.compiled_table import CalledPlan
+from router.compiler.compiled_table import CALL_FAILURES, CalledPlan
+from router.ros import services
 from tests.acceptance.ros_peer import PATIENCE
-from tests.acceptance.service_clients import Service, ServiceClients
+from tests.acceptance.service_clients import ARM, Service, ServiceClients
 from tests.acceptance.service_server import ServiceServer
 from tests.readable import readable
 from tests.ros.opening import SPAN, open_ros
 from tests.ros.peers import wait_until
+from tests.services.conftest import PROTOS, compiled
 
 LIGHT = Service("light", "std_srvs/srv/SetBool")
 PLAN = CalledPlan("light", LIGHT.name, LIGHT.type, {}, 0, 0, {}, SPAN)
@@ -57,3 +61,23 @@ def test_a_response_is_taken_that_waits_behind_those_to_other_clients() -> None:
         announced.wait_for(6)
         assert [response.number for response in client.take_all(6)] == [2]
         assert list(client.take_all(6)) == []
+
+
+def test_calls_are_cancelled_that_come_while_their_service_closes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stays open for a moment after its last response."""
+    monkeypatch.setattr(services, "LINGER_S", 3.0)
+    plan = compiled(tmp_path, PROTOS).services[0]
+    with ExitStack() as opened:
+        announced, ros = Announced(opened), open_ros()
+        opened.callback(ros.close)
+        served = ros.open_service(plan, announced.eventfd)
+        clients = opened.enter_context(ServiceClients())
+        first = clients.begin(ARM, {"data": True})
+        announced.wait_for(1)
+        closing = threading.Thread(target=ros.close_services, args=([served],))
+        closing.start()
+        assert first.get(timeout=PATIENCE)["message"] == CALL_FAILURES["cancelled"]
+        assert clients.call(ARM, {"data": True})["message"] == CALL_FAILURES["cancelled"]
+        closing.join()
