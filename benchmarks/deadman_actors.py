@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import signal
 import socket
 import struct
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.deadman_sources import WRAP, envelope_class
+from router.net.ready import readable
 from tests.acceptance.site import ROOT
 
 SO_TIMESTAMPNS = 35
@@ -58,7 +58,7 @@ class Board:
     def arrivals(self, seconds: float) -> Iterator[Arrival]:
         """What comes within some time, from what has come already on."""
         end = time.monotonic() + seconds
-        while select.select([self._socket], [], [], max(0, end - time.monotonic()))[0]:
+        while readable([self._socket], end - time.monotonic()):
             yield self.next()
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import select
 import signal
 import socket
 import statistics
@@ -20,6 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from router.net.ready import readable
 from tests.deploy.machine import machine
 from tests.tables import ROUTES
 
@@ -82,7 +82,7 @@ def shown(name: str) -> str:
 def _next(board: socket.socket, operator: socket.socket) -> bytes | None:
     """What the board hears next while the operator drives; None if nothing comes."""
     deadline = time.monotonic() + PATIENCE
-    while not select.select([board], [], [], EVERY)[0]:
+    while not readable([board], EVERY):
         if time.monotonic() > deadline:
             return None
         operator.sendto(DRIVE, ROUTER)

@@ -73,6 +73,7 @@ import sys
 from pathlib import Path
 from router.cli.findings import print_findings
 from router.compiler import check_table
+from router.hosts import zone
 
 checked = check_table(Path(sys.argv[2]))
 print_findings(checked.diagnostics, sys.stderr)
@@ -82,7 +83,8 @@ table = checked.program.table
 if table.gateways:
     print("gateways")
 for listener in table.sockets:
-    print("socket", listener.address.value, listener.interface or "-")
+    if not zone(listener.address.value.host):  # systemd ignores an interface that is not there when it reads the unit
+        print("socket", listener.address.value, listener.interface or "-")
 for line in table.lines:
     print("line", line.address.value)
 if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):

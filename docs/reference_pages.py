@@ -73,8 +73,8 @@ TEST = (
     Section("Expect", "expect", "definitions.expect"),
 )
 UNITS = {
-    "address": "IPv4 address and port",
-    "endpoint_address": "IPv4 address or host name, and port",
+    "address": "IP address and port",
+    "endpoint_address": "IP address or host name, and port",
     "path": "path",
     "duration": "time",
     "age_limit": "time or {none: why}",

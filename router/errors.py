@@ -76,7 +76,7 @@ class Code(enum.Enum):
     MISSING_KEY = ("missing-key", "A required key is missing.")
     WRONG_TYPE = ("wrong-type", "A value of the wrong type for its key.")
     BAD_VALUE = ("bad-value", "A value of the right type that makes no sense here.")
-    BAD_ADDRESS = ("bad-address", "Not an IPv4 address with a port.")
+    BAD_ADDRESS = ("bad-address", "Not an IP address with a port.")
     UNKNOWN_QOS_VALUE = ("unknown-qos-value", "Not a ROS QoS setting.")
     # the wire definitions
     BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares something that cannot be routed.")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from time import monotonic, sleep
 from typing import TypeVar
 
 import pytest
@@ -58,7 +59,8 @@ class Computer:
 def computers(*names: str) -> Iterator[list[Computer]]:
     """New namespaces in which only the loopback interface is up; skip the test if they cannot be created.
 
-    They accept every source address (rp_filter 0), the kernel's default and the worst case for an attack.
+    They accept every source address (rp_filter 0), the kernel's default and the worst case for an attack. An IPv6
+    address can be used at once.
     """
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("needs root and `ip`, for network namespaces")
@@ -70,15 +72,24 @@ def computers(*names: str) -> Iterator[list[Computer]]:
             computer.ip("link", "set", "lo", "up")
             for which in ("all", "default"):
                 computer.run("sysctl", "-qw", f"net.ipv4.conf.{which}.rp_filter=0")
+                computer.run("sysctl", "-qw", f"net.ipv6.conf.{which}.accept_dad=0")
         yield found
 
 
 def cable(one: Computer, end: str, address: str, other: Computer, other_end: str, other_address: str) -> None:
-    """Connect two computers by a veth pair, with an interface name and an address (`10.78.1.1/24`) at each end."""
+    """Connect two computers by a veth pair, with an interface name and an address (`10.78.1.1/24`) at each end.
+
+    With IPv6 addresses, wait until the kernel lets both ends send to groups and receive from them.
+    """
     one.ip("link", "add", end, "type", "veth", "peer", "name", other_end, "netns", other.namespace)
     for computer, name, network in ((one, end, address), (other, other_end, other_address)):
         computer.ip("address", "add", network, "dev", name)
         computer.ip("link", "set", name, "up")
+    for computer, name, network in ((one, end, address), (other, other_end, other_address)):
+        deadline = monotonic() + 10
+        while ":" in network and not computer.ip("-6", "route", "show", "table", "local", "dev", name, "ff00::/8"):
+            assert monotonic() < deadline, f"{name} does not come up"
+            sleep(0.02)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import socket
 from itertools import cycle
 from pathlib import Path
 
+from router.net.addresses import family
 from tests.lanes import LANE, LANES
 
 GIVEN_BY_KERNEL = Path("/proc/sys/net/ipv4/ip_local_port_range")
@@ -18,7 +19,7 @@ def free_port(host: str = "127.0.0.1", kind: socket.SocketKind = socket.SOCK_DGR
 
 
 def _is_free(host: str, port: int, kind: socket.SocketKind) -> bool:
-    with socket.socket(socket.AF_INET, kind) as probe:
+    with socket.socket(family(host), kind) as probe:
         try:
             probe.bind((host, port))
         except OSError:

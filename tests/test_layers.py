@@ -10,23 +10,24 @@ from pathlib import Path
 
 ROUTER = Path(__file__).parents[1] / "router"
 
-GROUND = "declared errors shortage inputs assets lazy_import clock log threads"
-LANGUAGE = "declared errors shortage inputs assets lazy_import library table types compiler"
+GROUND = "declared errors shortage inputs assets hosts lazy_import clock log threads"
+LANGUAGE = "declared errors shortage inputs assets hosts lazy_import library table types compiler"
 IMPORTS = {
     "declared": "",
     "errors": "",
     "shortage": "",
     "inputs": "errors shortage",
     "assets": "",
+    "hosts": "",
     "clock": "",
     "lazy_import": "",
     "library": "declared errors shortage assets",
     "log": "clock errors lazy_import shortage",
     "threads": "clock log shortage",
-    "table": "errors inputs assets lazy_import",
+    "table": "errors hosts inputs assets lazy_import",
     "types": "declared errors inputs assets lazy_import",
     "values": "errors types",
-    "compiler": "declared errors inputs assets lazy_import library table types",
+    "compiler": "declared errors hosts inputs assets lazy_import library table types",
     "datagrams": "declared errors table types",
     "image": LANGUAGE,
     "net": f"{GROUND} {LANGUAGE} datagrams",
@@ -38,8 +39,7 @@ IMPORTS = {
     "recording": f"{GROUND} {LANGUAGE} datagrams net",
     "observe": f"{GROUND} {LANGUAGE} values datagrams net recording",
     "rehearsal": f"{LANGUAGE} values datagrams image carrier recording services",
-    "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal"
-    " services",
+    "tools": f"{GROUND} {LANGUAGE} values datagrams image net carrier ros gateway recording observe rehearsal services",
     "app": f"{GROUND} {LANGUAGE} values datagrams image net carrier startup_image ros gateway recording observe"
     " services",
     "cli": f"{GROUND} {LANGUAGE} values datagrams net ros gateway recording observe rehearsal tools image carrier"
@@ -47,8 +47,8 @@ IMPORTS = {
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 
-PURE = {"declared", "errors", "lazy_import", "library", "table", "types", "values", "compiler", "datagrams", "image"}
-PURE |= {"services"}
+PURE = {"declared", "errors", "hosts", "lazy_import", "library", "table", "types", "values", "compiler", "datagrams"}
+PURE |= {"image", "services"}
 IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 

@@ -18,7 +18,7 @@ SLOW = {
 
 LOG = {"router", "router.clock", "router.log", "router.shortage"}
 GROUND = {"router.declared", *LOG}
-NET = {"router.net", "router.net.kernel", "router.net.sockets"}
+NET = {"router.hosts", "router.net", "router.net.addresses", "router.net.kernel", "router.net.sockets"}
 
 
 def imported(script: str) -> set[str]:

@@ -7,7 +7,6 @@ second one are `METRIC@again`.
 from __future__ import annotations
 
 import os
-import select
 import signal
 import socket
 import tempfile
@@ -22,6 +21,7 @@ from benchmarks.versus.helpers import IMU, SENSOR_BOARD, Helper, first_message
 from benchmarks.versus.runs import Traffic, run
 from benchmarks.versus.subject import START_SECONDS, Subject
 from benchmarks.versus.trial import Metrics, Trial
+from router.net.ready import readable
 from router.tools.running_router import post
 
 RATE, SECONDS = 5000, 60
@@ -108,7 +108,7 @@ def _working(trial: Trial, ports: Ports) -> Iterator[tuple[Subject, Metrics]]:
             datagram = dict(reversed(datagrams(trial.contender.payloads)))[IMU.case]
             metrics: Metrics = {}
             while awaited:
-                for each in select.select([*awaited], [], [], EVERY)[0]:
+                for each in readable(awaited, EVERY):
                     metrics[awaited.pop(each)] = round(time.monotonic() - began, 4)
                 sender.sendto(datagram, ("127.0.0.1", ports.listen[0]))
                 subject.check(began + START_SECONDS)

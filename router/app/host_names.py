@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from router.clock import monotonic_ns
 from router.log import logger
-from router.net.udp import addresses_of
+from router.net.addresses import addresses_of
 from router.threads import Thread
 
 _RETRY_S = 2.0
@@ -65,7 +65,7 @@ class HostNames:
                         "host name not resolved: nothing is sent to its endpoints, or accepted from them",
                         host=name,
                         why=why,
-                        remedy=f"check the name with `getent ahostsv4 {name}`, or write the address",
+                        remedy=f"check the name with `getent ahosts {name}`, or write the address",
                     )
                 reported, resolved_at = why, monotonic_ns()
             self._stopped.wait(_RETRY_S)
@@ -84,7 +84,7 @@ class HostNames:
         reasons = [self._why_unusable(name, host) for host in found]
         host = next((host for host, why in zip(found, reasons, strict=True) if not why), None)
         if host is None:
-            return ", ".join(dict.fromkeys(reasons)) or "it has no IPv4 address"
+            return ", ".join(dict.fromkeys(reasons)) or "it has no address"
         with self._lock:
             self.hosts = {**self.hosts, name: host}
         if not self._changed():

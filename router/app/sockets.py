@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 
 from router.app.change import Change
 from router.carrier.sender import NativeSender
-from router.compiler.network import LOOPBACK, WILDCARD, destination, sent_from
+from router.compiler.network import destination, sent_from
 from router.errors import ConfigurationError
+from router.hosts import any_of, bracketed, is_any, is_loopback, zone
 from router.log import logger
+from router.net.addresses import know
 from router.net.sockets import ListeningSocket, placed
 from router.net.udp import Listener, absence, open_sending, usual_source, why_no_way
 from router.startup_image.head_start import HeadStart
@@ -64,14 +66,14 @@ def _check_reachable(endpoint: endpoints.Endpoint, is_new: bool) -> None:
 def _check_source(endpoint: endpoints.Endpoint, sender: NativeSender) -> None:
     """Warn if datagrams leave with a source address other than that of the route to the endpoint."""
     own, usual = sender.leaves_from, usual_source(endpoint.address.value)
-    if own in (WILDCARD, usual) or usual is None or usual.startswith(LOOPBACK):
+    if is_any(own) or own == usual or usual is None or is_loopback(usual):
         return
     logger.warning(
         "datagrams to this endpoint have another network's source address; firewalls may drop them",
         endpoint=endpoint.name,
         address=own,
         route=usual,
-        remedy="use `send_from: ephemeral`, or a listener at 0.0.0.0 or at the address of the route",
+        remedy=f"use `send_from: ephemeral`, or a listener at {bracketed(any_of(own))} or at the address of the route",
     )
 
 
@@ -112,6 +114,7 @@ class Sockets:
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
         self._of_head_start: list[ListeningSocket] = [*head_start.listening.values()] if head_start else []
         self._senders: dict[str, tuple[object, NativeSender]] = {**head_start.senders} if head_start else {}
+        self._link_local: list[str] = []
         self._drops = drops
 
     # adoption of another program
@@ -192,6 +195,9 @@ class Sockets:
         table = change.program.table
         senders = change.program.udp_senders
         self._senders = {to.name: (destination(table, to), sockets.senders[to.name]) for to in senders}
+        addresses = [each.address.value for each in table.endpoints.values()]
+        addresses += [each.address.value for each in table.listeners.values()]
+        self._link_local = [host for host, _ in addresses if zone(host)]
 
     def finish(self, change: Change) -> None:
         """Close the sockets that only the earlier program used."""
@@ -199,18 +205,24 @@ class Sockets:
             change.sockets.unused.close()
 
     def follow_interfaces(self) -> None:
-        """Join and send to groups on the interfaces that have appeared. Not thread-safe."""
+        """Join and send to groups on the interfaces that have appeared, and find link-local hosts there.
+
+        Not thread-safe.
+        """
+        for host in self._link_local:
+            know(self._library, host)
         for listener in self.listeners.values():
             listener.join_groups()
         for _, sender in self._senders.values():
-            if sender.has_interface:
-                sender.follow_interface()
+            sender.follow_interface()
 
     @property
     def may_lose_interfaces(self) -> bool:
         """Whether listeners or senders depend on addresses or interfaces that may disappear and return."""
-        return any(sender.has_interface for _, sender in self._senders.values()) or any(
-            each.interface or each.has_groups or each.is_waiting or each.address.host != WILDCARD
+        if self._link_local or any(sender.has_interface for _, sender in self._senders.values()):
+            return True
+        return any(
+            each.interface or each.has_groups or each.is_waiting or not is_any(each.address.host)
             for each in self.listeners.values()
         )
 

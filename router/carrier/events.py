@@ -7,11 +7,10 @@ import os
 import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from socket import inet_ntoa
 from typing import Union, cast
 
 from router.carrier.threads import NativeThread
-from router.compiler.metrics import Answer, Evidence, Mismatch, Report, origin_text
+from router.compiler.metrics import Answer, Evidence, Mismatch, Report
 from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS, why_refused
 from router.declared import (
     NO_NAME,
@@ -29,7 +28,9 @@ from router.declared import (
     StateContent,
     StateEvent,
 )
+from router.hosts import bracketed
 from router.image.names import Names
+from router.net.addresses import host_text, origin_text
 from router.threads import Thread, join_or_abandon
 
 _PULSE_MS = 5000
@@ -167,17 +168,17 @@ class EventReader:
 
     def _of_datagram(self, record: memoryview) -> CountedReport:
         event, begin = DatagramEvent.from_buffer(record), ctypes.sizeof(DatagramEvent)
-        place, data = self._name(event.listener), bytes(record[begin : begin + event.length])
-        host = inet_ntoa(event.address.to_bytes(4, "big"))
-        port = f":{event.port}" if event.port else ""
-        sender = f"from {host}{port}" if event.address else "from the serial line"
+        listener, data = self._name(event.listener), bytes(record[begin : begin + event.length])
+        host = host_text(event.address)
+        place = f"{bracketed(host)}:{event.port}" if event.port else host
+        sender = f"from {place}" if event.address else "from the serial line"
         if event.kind == EventKind.SUPERSEDED:
-            detail = f"{sender}: {self._superseded(place, data)}"
-            return CountedReport(event.counter, Report("supersede", place, "", "superseded", None, detail))
-        what = self._why_rejected(place, event.reason, data, event.length)
+            detail = f"{sender}: {self._superseded(listener, data)}"
+            return CountedReport(event.counter, Report("supersede", listener, "", "superseded", None, detail))
+        what = self._why_rejected(listener, event.reason, data, event.length)
         detail = sender + (f": {what}" if what else "")
-        mismatch = Mismatch(place, host, what) if event.reason in _MISMATCHES and event.length else None
-        report = Report("reject", place, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
+        mismatch = Mismatch(listener, host, what) if event.reason in _MISMATCHES and event.length else None
+        report = Report("reject", listener, "", REJECTIONS[event.reason], None, detail, mismatch=mismatch)
         return CountedReport(event.counter, report)
 
     def _lost(self, record: memoryview) -> CountedReport:

@@ -10,6 +10,7 @@ import ctypes
 from router import declared as c
 from router.carrier.deadmen import NativeDeadman, open_deadman, replaced, successors
 from router.carrier.owned import OwnedPointer, open_native
+from router.net.addresses import know
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -79,6 +80,8 @@ class LoadedImage:
         self._before = before._opened if before is not None else {}
         self._places = {image.symbols[number]: words for number, words in image.imports}
         self._copy()
+        for host in image.hosts:
+            know(library, host)
         is_simulated = any(("sender", name) in self._objects for name, _ in image.link_ends)
         for opening in image.openings:
             if not opening[-1] and not (is_simulated and opening[1] == "server_open"):

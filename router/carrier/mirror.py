@@ -7,8 +7,6 @@ import os
 import struct
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache
-from socket import inet_ntoa
 from typing import Any, Generic, TypeVar
 
 from router.carrier.ring import Ring
@@ -16,6 +14,7 @@ from router.compiler.refusals import DROP_REASON_NAMES, REJECTIONS, why_refused
 from router.datagrams import Peer
 from router.declared import NO_NAME, ROUTED, Action, ActionRecord, MirrorRecord
 from router.image.names import Names
+from router.net.addresses import host_text
 
 T = TypeVar("T")
 
@@ -62,7 +61,7 @@ class MirrorRing:
             data = records[position + _HEAD.size : position + _HEAD.size + length]
             sender = name(endpoint) if endpoint >= 0 else ""
             why = REJECTIONS[reason] if reason != ROUTED else ""
-            yield at, name(listener), (_host(address), port), sender, why, data
+            yield at, name(listener), (host_text(address), port), sender, why, data
             position += size
 
 
@@ -107,8 +106,3 @@ def _all_of(ring: Ring) -> bytes:
     while records := ring.take():
         pieces.append(bytes(records))
     return b"".join(pieces)
-
-
-@cache
-def _host(address: int) -> str:
-    return inet_ntoa(address.to_bytes(4, "big"))

@@ -6,14 +6,16 @@ import ctypes
 import socket
 from collections.abc import Collection
 
-from router.net.sockets import ListeningSocket, address_beside, is_beside, leaves_from
+from router.hosts import is_address, is_any, is_ipv6
+from router.net.addresses import know
+from router.net.sockets import ListeningSocket, address_beside, is_beside, leaves_from, settle
 
 
 class NativeSender:
     """Sends to one address, through a socket that `net.sockets.open_sending` has opened for `source`. Owns the socket.
 
-    `address` is that of its `struct sender`. `leaves_from` is the address that the socket is bound to, 0.0.0.0 if the
-    kernel chooses one for each datagram; `is_bound`: it sends from the port of its listener. `cast` is as in
+    `address` is that of its `struct sender`. `leaves_from` is its source address, 0.0.0.0 or :: if the kernel chooses
+    one for each datagram; `is_bound`: it sends from the port of its listener. `cast` is as in
     `compiler.network`: until the network interface of a group is there, sending fails with EBADF. To a host name, and
     until an address is learned, it fails with EDESTADDRREQ.
     """
@@ -31,7 +33,7 @@ class NativeSender:
         self._cast = cast
         self._place(source, opened)
         host, port = destination
-        number = int.from_bytes(socket.inet_aton(host), "big") if host.replace(".", "").isdigit() else 0
+        number = know(library, host) if is_address(host) else 0
         self.address = int(library.sender_open(self._aimed(), self._listening, number, port) or 0)
         if not self.address:
             opened.close()
@@ -50,8 +52,14 @@ class NativeSender:
         return isinstance(self._cast, tuple) and self._cast[0] is not None
 
     def follow_interface(self) -> None:
-        """Send to the group through the interface that has the name now."""
-        self._library.sender_move(self.address, self._aimed(), self._listening)
+        """Send to a group through the interface that has the name now, and from the listener's address if that is
+        there now.
+        """
+        if self.has_interface:
+            self._library.sender_move(self.address, self._aimed(), self._listening)
+        if self.source is not None and self.is_bound and is_any(self.leaves_from):
+            settle(self.socket, self.source)
+            self._place(self.source, self.socket)
 
     def _aimed(self) -> int:
         """Prepare the socket for its cast, and return its descriptor, or -1 while sending must fail."""
@@ -72,7 +80,7 @@ class NativeSender:
         """Return whether a newly opened socket would have the same source address and port."""
         if self.source is not source or source is None or not self.is_bound:
             return self.source is source
-        return self.leaves_from == address_beside(source, listening)[0]
+        return is_ipv6(self.leaves_from) or self.leaves_from == address_beside(source, listening)[0]
 
     def close(self) -> None:
         """Close the socket. Sending afterwards raises OSError."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import socket
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple, Union
 from weakref import finalize
@@ -26,6 +25,7 @@ from router.declared import MOST_COUNTERS, RecordKind
 from router.image.image import Image
 from router.image.names import Names
 from router.image.writer import write_image
+from router.net.addresses import seen
 from router.table.addresses import LEARNED
 
 Peer = tuple[str, int]
@@ -111,10 +111,8 @@ class Simulation:
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_at: int) -> None:
         """Receive a datagram. `arrived_at` is wall-clock time. Raises KeyError for an unknown listener."""
         host, port = peer
-        number = self._in_use.listeners[listener]
-        self._library.simulation_datagram(
-            self._opened.address, number, _number(host), port, data, len(data), arrived_at
-        )
+        number, sender = self._in_use.listeners[listener], seen(self._library, host)
+        self._library.simulation_datagram(self._opened.address, number, sender, port, data, len(data), arrived_at)
 
     def message(self, topic: str, data: bytes, sent_at: int) -> None:
         """Take a message from ROS. `sent_at` is wall-clock time. Raises KeyError for a topic without a route."""
@@ -256,7 +254,3 @@ class _Running:
         self.topic_numbers: Mapping[str, int] = {topic: number for number, topic in enumerate(routes)}
         topics = [c.RosTopic(routes=each, route_count=len(each)) for each in routes.values()]
         self.topics = (c.RosTopic * len(topics))(*topics)
-
-
-def _number(host: str) -> int:
-    return int.from_bytes(socket.inet_aton(host), "big")

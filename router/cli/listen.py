@@ -150,8 +150,7 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     address = udp.listening(place, table)
     envelope = wire.envelopes.first if table is None else udp.received_at(address, table, wire.envelopes)
     with udp.open_udp(address, place, udp.endpoint_of(place, table)) as receiver:
-        host, port = receiver.getsockname()
-        say(f"listening on {host}:{port}; press Ctrl-C to stop")
+        say(f"listening on {udp.address_of(receiver)}; press Ctrl-C to stop")
         with until_interrupted():
             print_batches(listen(receiver, wire, envelope, udp.peer_names(table)), args)
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _EXAMPLES = (
     "router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000",
     "router send imu_info -t routes/sim.yaml --to rover --from sensor_board",
+    "router send imu_info --to '[fd00::1]:5000'",
     "router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation",
     "router send detection frame=5 geometry length=9 -t vision.yaml --to vision",
     "router send manual_drive --to rover --rate 20Hz --count 1000",
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if table is not None and (link := links.link_of(args.to, table)) is not None:
         return _send_frames(args, link, table, data, count)
     to = udp.destination(args.to, table)
-    origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
+    origin = udp.origin_of(to, udp.origin(args.origin, table) if args.origin else udp.ANYWHERE)
     sent = Sent()
     # Without --count, Ctrl-C stops sending; the summary is printed all the same.
     with udp.open_udp(origin, "--from") as sender, until_interrupted():

@@ -22,7 +22,7 @@ from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
 from router.compiler.lowering import Lowered, lower_table
 from router.compiler.metrics import Counters
-from router.compiler.network import network_findings
+from router.compiler.network_findings import network_findings
 from router.compiler.replies import reply_findings
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.services import check_services

@@ -17,7 +17,7 @@ from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.expressions.operators import presence_hint
 from router.compiler.expressions.scope import BrokenStateError
 from router.compiler.expressions.tree import Node
-from router.compiler.network import loop_finding
+from router.compiler.network_findings import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest, one_of
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint

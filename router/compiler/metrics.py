@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from router.declared import HISTOGRAM_BOUNDS, MOST_COUNTERS
@@ -577,11 +576,6 @@ class Counters:
                 counts[run] = [0] * length
             del self._indexes[metric][labels]
             self._free.setdefault(length, []).append(run.start)
-
-
-def origin_text(origin: int) -> str:
-    """Return an address and port, as native code packs them, as text."""
-    return f"{IPv4Address(origin >> 16)}:{origin & 0xFFFF}"
 
 
 _COUNTED = ("counter", "histogram")

@@ -1,305 +1,43 @@
-"""Checks addresses for clashes, and for destinations that lead back to the router; identifies senders."""
+"""Who is who on the network: which listeners receive from an endpoint, where datagrams to it leave, and how it is
+recognised.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
-from ipaddress import IPv4Network
-from itertools import combinations, product
 from typing import TypeAlias
 
-from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
-from router.table.addresses import Address, LinkPlace, SerialPlace
+from router.hosts import ANY_HOST, is_any, is_ipv6, is_loopback
+from router.table.addresses import Address, IPNetwork, LinkPlace, SerialPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import EPHEMERAL, Endpoint, EndpointKind, Listener
-from router.table.model.gateways import Gateway, Transport
-from router.table.model.routes import ANY
-
-WILDCARD = "0.0.0.0"
-LOOPBACK = "127."
 
 Cast: TypeAlias = tuple[str | None, int, bool] | str | None
 """How a sender reaches several machines: interface, hops and loop of a group, "broadcast", or None for one machine."""
 
-
-@dataclass(frozen=True, slots=True)
-class _LocalAddress:
-    """A local address, with the name of its owner for findings. UDP and TCP addresses do not clash."""
-
-    owner: str
-    address: Located[Address]
-    is_udp: bool = False
-    interface: str | None = None
+ON_LINE = ANY_HOST, 0
+"""The address that a frame of a serial line counts as coming from."""
 
 
-def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for the addresses of a table and for its listeners."""
-    for first, second in combinations(_local_addresses(table), 2):
-        if first.is_udp == second.is_udp and _overlap(first, second):
-            message = f"{second.owner} uses the address of {first.owner}"
-            hint = "use another port"
-            if first.interface != second.interface:  # a socket without an interface receives on all interfaces
-                hint += f", or give {second.owner if first.interface else first.owner} an 'interface'"
-            hint += ": only one of them can receive there"
-            yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
-    yield from _group_findings(table)
-    yield from _several_machines(table)
-    yield from _learned_findings(table)
-    yield from _listener_findings(table)
-    yield from _link_findings(table)
-    for endpoint in table.endpoints.values():
-        if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
-            message = f"'{endpoint.name}' is not a board, so it receives NaN and infinity anyway"
-            yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "remove `allow_non_finite`")
-    yield from _gateway_findings(table)
-    sources = {source.value for route in table.routes for source in route.sources}
-    reported: set[str] = set()
-    for one, other in combinations(table.endpoints.values(), 2):
-        if other.name not in reported and (clash := _clash(one, other, sources)):
-            reported.add(other.name)
-            yield clash
-
-
-def _local_addresses(table: RouteTable) -> Iterator[_LocalAddress]:
-    for listener in table.sockets:
-        interface = listener.interface
-        yield _LocalAddress(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
-    for listener in table.links:
-        if listener.accepts:
-            yield _LocalAddress(f"listener '{listener.name}'", listener.address)
-    if table.http is not None:
-        yield _LocalAddress("'http'", table.http.address)
-    if table.foxglove is not None:
-        yield _LocalAddress("'foxglove'", table.foxglove.address)
-    for gateway in table.gateways.values():
-        owner = f"gateway '{gateway.name}'"
-        if gateway.receive is not None:
-            yield _LocalAddress(owner, gateway.receive, is_udp=True)
-        if gateway.address is not None and gateway.transport.value is not Transport.UDP:
-            yield _LocalAddress(owner, gateway.address)
-
-
-def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for gateways that send to the router itself, or have the same Zenoh key."""
-    keys: dict[str, Gateway] = {}
-    for gateway in table.gateways.values():
-        if gateway.address is not None and gateway.transport.value is Transport.UDP:
-            yield from _own_address(gateway, gateway.address, table)
-        if gateway.zenoh is not None:
-            first = keys.setdefault(gateway.zenoh.key.value, gateway)
-            if first is not gateway:
-                message = f"gateway '{gateway.name}' uses the key of gateway '{first.name}'"
-                yield Diagnostic(gateway.zenoh.key.span, Code.ADDRESS_CLASH, message, "choose another key")
-
-
-def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for a gateway that sends to a listener or gateway of this table: messages could loop endlessly."""
-    own = {f"listener '{listener.name}'": listener.address.value for listener in table.sockets}
-    for other in table.gateways.values():
-        if other.receive is not None:
-            own["'receive' address" if other is gateway else f"gateway '{other.name}'"] = other.receive.value
-    for name, local in own.items():
-        if reaches(address.value, local):
-            message = f"'{gateway.name}' would send to the router's own {name} ({address.value})"
-            yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "write the address of its client")
-
-
-def _overlap(one: _LocalAddress, other: _LocalAddress) -> bool:
-    """Return whether two addresses overlap, so that the kernel cannot bind both. On two interfaces, they never do."""
-    if one.interface and other.interface and one.interface != other.interface:
-        return False
-    hosts = one.address.value.host, other.address.value.host
-    return one.address.value.port == other.address.value.port and (hosts[0] == hosts[1] or WILDCARD in hosts)
-
-
-def _group_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for listeners that would never receive the datagrams to their groups."""
-    for listener in table.listeners.values():
-        if listener.groups and listener.address.value.host != WILDCARD:
-            address = listener.address.value
-            message = f"listener '{listener.name}' is at {address}, where the kernel delivers nothing to a group"
-            hint = f"write 0.0.0.0:{address.port}; 'interface' selects the network"
-            yield Diagnostic(listener.address.span, Code.BAD_VALUE, message, hint)
-
-
-def _several_machines(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for groups and broadcast addresses that are used as one machine."""
-    sources = {source.value: source.span for route in table.routes for source in route.sources}
-    for endpoint in table.endpoints.values():
-        if endpoint.is_one_machine:
-            continue
-        key = "group" if endpoint.group is not None else "broadcast"
-        if endpoint.kind is EndpointKind.BOARD:
-            message = f"'{endpoint.name}' is a board, but '{key}' sends to any number of machines"
-            hint = "give each board an endpoint with its 'address': commands and deadmen are for known boards"
-            yield Diagnostic(endpoint.address.span, Code.BAD_VALUE, message, hint)
-        if endpoint.name in sources:
-            message = f"'{endpoint.name}' cannot be a source: no datagram comes from the address of its '{key}'"
-            hint = "name an endpoint with the 'address' of the sender"
-            yield Diagnostic(sources[endpoint.name], Code.BAD_VALUE, message, hint)
-
-
-def _learned_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for endpoints whose address is learned."""
-    sources = {source.value for route in table.routes for source in route.sources}
-    sources |= {called.source.source.value for called in table.called.values()}
-    for endpoint in table.endpoints.values():
-        address = endpoint.address
-        if not address.value.is_learned:
-            continue
-        if endpoint.kind is EndpointKind.BOARD and endpoint.because is None:
-            message = f"'{endpoint.name}' is a board, but any computer may send first and get its commands and brakes"
-            hint = "write the board's address, or say with `because` why nothing else can send to the listener"
-            yield Diagnostic(address.span, Code.MISSING_KEY, message, hint)
-        if endpoint.name not in sources and not table.broken:
-            message = f"the address of '{endpoint.name}' is never learned: no route names it as its source"
-            hint = "write a route for what it sends, or its address"
-            yield Diagnostic(address.span, Code.BAD_VALUE, message, hint)
-        for network in endpoint.networks:
-            if table.networks and not any(network.subnet_of(each) for each in table.networks.members):
-                message = f"'networks' of endpoints.{endpoint.name} has {network}, outside {table.networks}"
-                hint = "remove it: without 'networks', the endpoint has those of the table"
-                yield Diagnostic(address.span, Code.OUTSIDE_NETWORKS, message, hint)
-
-
-def networks_of(table: RouteTable, endpoint: Endpoint) -> Sequence[IPv4Network]:
-    """Return the networks in which the address of an endpoint may be learned; none for any."""
-    return endpoint.networks or (table.networks.members if table.networks is not None else ())
-
-
-def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for unknown listeners of endpoints, and for listeners that accept no sending endpoint."""
-    for endpoint in table.endpoints.values():
-        for named, known in (
-            (endpoint.listener, [*table.listeners]),
-            (endpoint.send_from, [*table.listeners, EPHEMERAL]),
-        ):
-            if named and named.value not in known and not table.broken & {"listen", f"listen/{named.value}"}:
-                hint = did_you_mean(named.value, known)
-                yield Diagnostic(named.span, Code.UNKNOWN_LISTENER, f"there is no listener '{named.value}'", hint)
-    sources = {source.value for route in table.routes for source in route.sources}
-    senders = [endpoint for endpoint in table.endpoints.values() if endpoint.name in sources]
-    accepted_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
-    if not senders or ANY in sources or None in accepted_by or table.broken:
-        return
-    for listener in table.sockets:
-        if listener.name not in accepted_by:
-            message = f"listener '{listener.name}' accepts none of the sending endpoints, so it rejects everything"
-            hint = f"remove it, or give an endpoint 'listener: {listener.name}'"
-            yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
-
-
-def _link_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Yield findings for serial lines that share a device, and for links without the right endpoints."""
-    devices: dict[Address, Listener] = {}
-    for line in table.lines:
-        other = devices.setdefault(line.address.value, line)
-        if other is not line:
-            message = f"listener '{line.name}' uses the device of listener '{other.name}'"
-            hint = "name another device: only one of them can open it"
-            yield Diagnostic(line.address.span, Code.ADDRESS_CLASH, message, hint)
-    for listener in table.links:
-        assert listener.link is not None  # noqa: S101 - it is a link
-        noun, at_its_end = listener.link.NOUN, [each for each in table.endpoints.values() if _is_at(each, listener)]
-        if not at_its_end and not table.broken:
-            message = f"nobody is at the other end of the {noun} '{listener.name}'"
-            hint = f"add an endpoint with `listener: {listener.name}` and "
-            hint += "the IP address of its board" if listener.accepts else "without 'address'"
-            yield Diagnostic(listener.span, Code.MISSING_KEY, message, hint)
-        known: dict[str, Endpoint] = {}
-        for each in at_its_end:
-            if (first := known.setdefault(each.address.value.host, each)) is each:
-                continue
-            message = f"'{first.name}' and '{each.name}' are both at the other end of '{listener.name}'"
-            hint = f"a {noun} has one endpoint{' for each address' * listener.accepts}: remove the other"
-            yield Diagnostic(each.span, Code.ADDRESS_CLASH, message, hint)
-    for endpoint in table.endpoints.values():
-        yield from _misplaced(table, endpoint)
-
-
-def _misplaced(table: RouteTable, endpoint: Endpoint) -> Iterator[Diagnostic]:
-    """Yield findings for keys of an endpoint that are only for UDP or only for a link."""
-    nouns = {listener.name: listener.link.NOUN for listener in table.links if listener.link is not None}
-    if endpoint.send_from is not None and endpoint.send_from.value in nouns:
-        noun = nouns[endpoint.send_from.value]
-        message = f"'{endpoint.send_from.value}' is a {noun}, so no UDP datagrams leave from it"
-        yield Diagnostic(endpoint.send_from.span, Code.BAD_VALUE, message, "name a listener with an address")
-    if endpoint.listener is None or endpoint.listener.value not in nouns:
-        return
-    is_udp = not _is_on_link(endpoint)
-    spans = {
-        "address": endpoint.address.span if is_udp else None,
-        "source_port": endpoint.source_port.span if endpoint.source_port else None,
-        "send_from": endpoint.send_from.span if endpoint.send_from else None,
-    }
-    for key, span in spans.items():
-        if span is not None:
-            noun = nouns[endpoint.listener.value]
-            message = f"'{endpoint.name}' is at the other end of the {noun} '{endpoint.listener.value}'"
-            yield Diagnostic(span, Code.BAD_VALUE, message, f"remove '{key}', which is for UDP")
-
-
-def _is_at(endpoint: Endpoint, listener: Listener) -> bool:
+def is_at(endpoint: Endpoint, listener: Listener) -> bool:
     return endpoint.listener is not None and endpoint.listener.value == listener.name
 
 
-def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | None:
-    """Return a finding if a received datagram could be from either endpoint."""
-    if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
-        return None
-    if _is_on_link(one) or _is_on_link(other):  # which have findings of their own
-        return None
-    if one.listener and other.listener and one.listener.value != other.listener.value:
-        return None
-    if one.address.value.is_learned:
-        return _learned_clash(one, other)
-    host = one.address.value.host
-    if one.source_port is None or other.source_port is None:
-        message = f"endpoints '{one.name}' and '{other.name}' share the address {host}"
-        hint = "correct the address, or give each endpoint its own 'source_port'"
-        if one.listener or other.listener:
-            hint += " or 'listener'"
-        return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
-    if one.source_port.value == other.source_port.value:
-        message = f"endpoints '{one.name}' and '{other.name}' share the address {host} and the source port"
-        return Diagnostic(other.source_port.span, Code.ADDRESS_CLASH, message, "give each its own source_port")
-    return None
+def is_on_link(endpoint: Endpoint) -> bool:
+    return isinstance(endpoint.address.value, LinkPlace)
 
 
-def _learned_clash(one: Endpoint, other: Endpoint) -> Diagnostic | None:
-    """Return a finding if both endpoints could be learned from one sender."""
-    ports = [each.source_port.value for each in (one, other) if each.source_port is not None]
-    pairs = product(one.networks, other.networks)
-    if len({*ports}) > 1 or (one.networks and other.networks and not any(a.overlaps(b) for a, b in pairs)):
-        return None
-    message = f"a sender could be learned as '{one.name}' or as '{other.name}'"
-    hint = "give each its own 'source_port', 'networks' or 'listener'"
-    return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
-
-
-def loop_finding(
-    table: RouteTable, endpoint: Endpoint, span: SourceSpan, case: str, sources: AbstractSet[str]
-) -> Diagnostic | None:
-    """Return a finding if a destination, named at `span`, is one of `sources` of `case`, or the router itself."""
-    if endpoint.name in sources:
-        message = f"'{endpoint.name}' would get its own '{case}' back"
-        return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
-    for listener in table.sockets:
-        own = listener.address.value
-        returns = endpoint.broadcast is not None and own == (WILDCARD, endpoint.broadcast.value.port)
-        if returns or reaches(endpoint.address.value, own):
-            message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
-            hint = "remove it, or correct its address: datagrams would return to the router in an endless loop"
-            return Diagnostic(span, Code.FORWARDING_LOOP, message, hint)
-    return None
+def takes_from(listener: Listener, host: str) -> bool:
+    """Return whether a listener can receive from an IP address: a socket only from those of its family."""
+    return listener.link is not None or listener.address.value.is_ipv6 == is_ipv6(host)
 
 
 def reaches(address: Address, own: Address) -> bool:
     """Return whether datagrams to an address arrive at a listener of this computer."""
-    if address.port != own.port:
+    if address.port != own.port or address.is_ipv6 != own.is_ipv6:
         return False
-    return address.host in (own.host, WILDCARD) or (own.host == WILDCARD and address.host.startswith(LOOPBACK))
+    return address.host == own.host or is_any(address.host) or (is_any(own.host) and is_loopback(address.host))
 
 
 def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
@@ -312,16 +50,20 @@ def sent_from(table: RouteTable, endpoint: Endpoint) -> str | None:
         return None if endpoint.send_from.value == EPHEMERAL else endpoint.send_from.value
     if endpoint.listener is not None:
         return endpoint.listener.value
-    places = {listener.address.value for listener in table.sockets}
-    return table.sockets[0].name if len(places) == 1 else None
+    families = fitting(table, endpoint)
+    listeners = [each for each in table.sockets if each.address.value.is_ipv6 in families]
+    places = {each.address.value for each in listeners}
+    return listeners[0].name if len(places) == 1 else None
 
 
-ON_LINE = WILDCARD, 0
-"""The address that a frame of a serial line counts as coming from."""
-
-
-def _is_on_link(endpoint: Endpoint) -> bool:
-    return isinstance(endpoint.address.value, LinkPlace)
+def fitting(table: RouteTable, endpoint: Endpoint) -> AbstractSet[bool]:
+    """Return whether the address of an endpoint is an IPv6 one; both if it is not known yet and may be either."""
+    address = endpoint.address.value
+    if address.is_known:
+        return {address.is_ipv6}
+    named = [each.value for each in (endpoint.listener, endpoint.send_from) if each is not None]
+    own = {listener.address.value.is_ipv6 for listener in table.sockets if listener.name in named}
+    return own or {listener.address.value.is_ipv6 for listener in table.sockets} or {False, True}
 
 
 def sent_by(endpoint: Endpoint) -> tuple[str, int]:
@@ -340,13 +82,16 @@ def arrival(table: RouteTable, listener: str, peer: tuple[str, int], sender: str
     They differ if only one of the tables has `sender` at a link. None: this table does not receive it.
     """
     endpoint, place = table.endpoints.get(sender), table.listeners.get(listener)
-    if endpoint is not None and _is_on_link(endpoint) and endpoint.listener is not None:
+    if endpoint is not None and is_on_link(endpoint) and endpoint.listener is not None:
         return endpoint.listener.value, sent_by(endpoint)
     if place is not None and (place.line is not None) == (peer == ON_LINE):
         return listener, peer
-    if endpoint is None or not endpoint.address.value.is_known or peer != ON_LINE or not table.sockets:
+    if endpoint is None or not endpoint.address.value.is_known or peer != ON_LINE:
         return None
-    return endpoint.listener.value if endpoint.listener is not None else table.sockets[0].name, sent_by(endpoint)
+    if endpoint.listener is not None:
+        return endpoint.listener.value, sent_by(endpoint)
+    taking = [each.name for each in table.sockets if takes_from(each, endpoint.address.value.host)]
+    return (taking[0], sent_by(endpoint)) if taking else None
 
 
 def destination(table: RouteTable, endpoint: Endpoint) -> tuple[tuple[str, int], bool, Cast]:
@@ -363,28 +108,44 @@ def destination(table: RouteTable, endpoint: Endpoint) -> tuple[tuple[str, int],
     return (host, port), endpoint.kind is EndpointKind.BOARD, cast
 
 
-def recognisers(
-    endpoints: Mapping[str, Endpoint], listener: str | None
-) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
+def recognisers(table: RouteTable, listener: str | None) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """Return the names of endpoints by IP address, and by (IP address, port), for datagrams that `listener` receives.
 
     Endpoints of other listeners are omitted, or of all links if `listener` is None, and those whose address is not
-    known; without a listener of their own, endpoints are recognised by all UDP sockets. An
-    IP address that several endpoints share without source ports identifies none of them; this is only valid if none is
-    a source.
+    known; without a listener of their own, endpoints are recognised by all UDP sockets for their kind of IP address: in
+    native code, the number of an IPv6 address could pass for an IPv4 sender's. An IP address that several endpoints
+    share without source ports identifies none of them; this is only valid if none is a source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}
-    links = {each.listener.value for each in endpoints.values() if each.listener and _is_on_link(each)}
-    for endpoint in endpoints.values():
+    endpoints, place = table.endpoints.values(), table.listeners.get(listener or "")
+    links = {each.listener.value for each in endpoints if each.listener and is_on_link(each)}
+    for endpoint in endpoints:
         own = endpoint.listener.value if endpoint.listener is not None else None
         if own != listener and (listener in links or own in links or None not in (own, listener)):
             continue
         if endpoint.address.value.is_name or endpoint.address.value.is_learned:
             continue
         host, _ = sent_by(endpoint)
+        if place is not None and not takes_from(place, host):
+            continue
         if endpoint.source_port is not None:
             by_address[host, endpoint.source_port.value] = endpoint.name
         else:
             by_host.setdefault(host, []).append(endpoint.name)
     return {host: names[0] for host, names in by_host.items() if len(names) == 1}, by_address
+
+
+def may_learn(table: RouteTable, endpoint: Endpoint, listener: Listener) -> bool:
+    """Return whether the address of an endpoint may be learned from some sender at a listener."""
+    networks = networks_of(table, endpoint)
+    here = endpoint.listener is None or is_at(endpoint, listener)
+    return here and (not networks or bool(networks_of(table, endpoint, listener)))
+
+
+def networks_of(table: RouteTable, endpoint: Endpoint, listener: Listener | None = None) -> Sequence[IPNetwork]:
+    """Return the networks in which the address of an endpoint may be learned, at a listener or at all; none for any."""
+    networks = endpoint.networks or (table.networks.members if table.networks is not None else ())
+    if listener is None:
+        return networks
+    return [each for each in networks if (each.version == 6) == listener.address.value.is_ipv6]

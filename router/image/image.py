@@ -22,12 +22,12 @@ class Image:
 
     To open, by name: `listeners` (name, address, interface, receive buffer, multicast groups), `senders` (name,
     address, whether it is a board, its cast as in `compiler.network`, listener to send from), and `topics` (name,
-    whether late subscribers get messages). `openings` lists the objects to open, in this order: (symbol, function,
-    arguments, what else identifies the object, whether it belongs to the clients of gateways). An argument that is a
-    tuple of one number is a symbol. Among them are the links of `link_ends` (endpoint, address or device) and the TCP
-    `servers`; in `listener_array`, links follow `listeners`. `timers` are adopted: (symbol, whether it is for a topic,
-    offset of its targets, offset of the target). `deadmen` and `client_deadmen` are (name, names that it sends to,
-    commands that it watches).
+    whether late subscribers get messages). `hosts` are IPv6 addresses whose numbers are in the memory. `openings` lists
+    the objects to open, in this order: (symbol, function, arguments, what else identifies the object, whether it
+    belongs to the clients of gateways). An argument that is a tuple of one number is a symbol. Among them are the links
+    of `link_ends` (endpoint, address or device) and the TCP `servers`; in `listener_array`, links follow `listeners`.
+    `timers` are adopted: (symbol, whether it is for a topic, offset of its targets, offset of the target). `deadmen`
+    and `client_deadmen` are (name, names that it sends to, commands that it watches).
 
     `names` are the names with a number, `series` the counters with an index, below `counters`. `mirror_lost` is the
     counter of what observers miss; None if nothing is observed from the start.
@@ -47,6 +47,7 @@ class Image:
     link_ends: list[tuple[str, str]]
     servers: list[str]
     topics: list[tuple[str, bool]]
+    hosts: list[str]
     openings: list[tuple[Symbol, str, tuple[Any, ...], tuple[Any, ...], bool]]
     timers: list[tuple[int, bool, int | None, int | None]]
     deadmen: list[tuple[str, list[str], list[tuple[str, str]]]]

@@ -15,6 +15,7 @@ from router import declared as c
 from router.compiler.checked import Target
 from router.compiler.compiled_table import Beside, CompiledTable, DeadmanPlan, RoutePlan, StatePlan, TopicPlan
 from router.compiler.metrics import Counters
+from router.hosts import host_number, is_ipv6
 from router.image.memory import Symbols
 from router.image.names import Names
 from router.table.addresses import LinkPlace
@@ -55,6 +56,7 @@ class Openings:
     program: CompiledTable
     names: Names
     symbols: Symbols = field(default_factory=Symbols)
+    hosts: set[str] = field(default_factory=set)
     listed: dict[Symbol, tuple[Symbol, str, tuple[Any, ...], tuple[Any, ...], bool]] = field(default_factory=dict)
 
     def _open(
@@ -65,6 +67,12 @@ class Openings:
 
     def _argument(self, *symbol: str | None) -> tuple[int]:
         return (Symbols.number(self.symbols.address(*symbol)),)
+
+    def host(self, host: str) -> int:
+        """Return the number of an IP address, and list the address if it is an IPv6 one."""
+        if is_ipv6(host):
+            self.hosts.add(host)
+        return host_number(host)
 
     def sequence(self, endpoint: str) -> int:
         """Open the sequence that numbers the router's messages for an endpoint."""
@@ -80,7 +88,7 @@ class Openings:
         settings = c.LinkSettings(
             framing=framing_of(link),
             medium=_MEDIA[type(link)],
-            host=0 if is_line else host_number(address.host),
+            host=0 if is_line else self.host(address.host),
             port=address.port,
             patience=self._patience(endpoint.name),
             endpoint=self.names.number(endpoint.name),
@@ -104,7 +112,7 @@ class Openings:
         refused = self.program.counters.index("datagrams_rejected", listener.name, "source_mismatch")
         of = self.names.number(listener.name), refused
         symbol = "server", listener.name
-        self._open(symbol, "server_open", self._argument("timers"), host_number(host), port, *of)
+        self._open(symbol, "server_open", self._argument("timers"), self.host(host), port, *of)
         return self._argument(*symbol)
 
     def _patience(self, endpoint: str) -> int:
@@ -207,11 +215,6 @@ class Openings:
             if target.label == endpoint and target.is_deferred and not target.is_topic
             for source in sources_of(plan)
         ]
-
-
-def host_number(host: str) -> int:
-    """Return an IPv4 address as a number."""
-    return int.from_bytes(bytes(map(int, host.split("."))), "big")
 
 
 def sources_of(plan: RoutePlan) -> Collection[str | None]:

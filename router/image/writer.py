@@ -15,14 +15,15 @@ from router.compiler.compiled_table import STRANGER, CompiledTable, DeadmanPlan,
 from router.compiler.lowering import LoweredFeed
 from router.compiler.lowering.arrays import Arrays
 from router.compiler.metrics import ENDPOINT_METRICS, UNKNOWN_CASE, Counters
-from router.compiler.network import destination, networks_of, recognisers, sent_from
+from router.compiler.network import destination, may_learn, networks_of, recognisers, sent_from
 from router.compiler.refusals import REJECTIONS
 from router.declared import NONE
+from router.hosts import as_ipv6
 from router.image.boards import write_boards
 from router.image.image import Image
 from router.image.memory import Memory, Symbols, address_in
 from router.image.names import Names
-from router.image.openings import Openings, host_number
+from router.image.openings import Openings
 from router.image.targets import TargetWriter, Timer, write_for_each
 from router.image.wire_schema import write_schema
 from router.table.model.endpoints import STALE_AFTER, Endpoint, Framing, Listener
@@ -70,6 +71,7 @@ def write_image(program: CompiledTable, names: Names | None = None) -> Image:
         link_ends=[(each.name, str(each.address.value)) for _, each in program.links],
         servers=[each.name for each in program.table.links if each.accepts],
         topics=[(each.label, each.qos.serves_late_joiners) for each in program.publishers],
+        hosts=sorted(openings.hosts),
         openings=[*openings.listed.values()],
         timers=[_timer(each, memory) for each in (*pacers, *targets.timers)],
         deadmen=[_deadman(plan) for plan in program.deadmen],
@@ -187,10 +189,11 @@ class _Writer:
 
     def _peers(self, listener: str) -> Iterator[c.Peer]:
         """Yield the peers by address; those with a port come first, as they have priority."""
-        by_host, by_address = recognisers(self.program.table.endpoints, listener)
+        by_host, by_address = recognisers(self.program.table, listener)
         known = [(host, port, name) for (host, port), name in by_address.items()]
         known += [(host, 0, name) for host, name in by_host.items()]
-        for address, _, port, name in sorted((host_number(host), not port, port, name) for host, port, name in known):
+        number = self.targets.openings.host
+        for address, _, port, name in sorted((number(host), not port, port, name) for host, port, name in known):
             peer = self._peer(name)
             peer.address, peer.port = address, port
             yield peer
@@ -213,14 +216,16 @@ class _Writer:
     def _learned(self, listener: str) -> Iterator[c.LearnedPeer]:
         """Yield the endpoints whose address this listener learns."""
         table = self.program.table
+        place = table.listeners[listener]
         sent_to = {each.name for each in self.program.senders}
         for endpoint in table.endpoints.values():
-            is_here = endpoint.listener is None or endpoint.listener.value == listener
-            if not endpoint.address.value.is_learned or not is_here:
+            if not endpoint.address.value.is_learned or not may_learn(table, endpoint, place):
                 continue
             networks = [
-                c.Network(address=int(each.network_address), mask=int(each.netmask))
-                for each in networks_of(table, endpoint)
+                c.Network(
+                    address=tuple(as_ipv6(str(each.network_address))), prefix=each.prefixlen + 128 - each.max_prefixlen
+                )
+                for each in networks_of(table, endpoint, place)
             ]
             yield c.LearnedPeer(
                 peer=self._peer(endpoint.name),

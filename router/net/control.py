@@ -10,6 +10,9 @@ import os
 import socket
 import struct
 
+from router.hosts import any_of
+from router.net.addresses import family, socket_address
+
 _BACKLOG = 64
 _CREDENTIALS = struct.Struct("3i")
 """struct ucred of <sys/socket.h>: process, user, group."""
@@ -41,12 +44,12 @@ def _owners() -> tuple[int, ...]:
 
 
 def connect(host: str, port: int, patience: float | None) -> socket.socket:
-    """Connect to the router of this computer that serves HTTP there. `host` is an IPv4 address. Raises OSError.
+    """Connect to the router of this computer that serves HTTP there. `host` is an IP address. Raises OSError.
 
     That router may serve all addresses of this computer. Waits up to `patience` (s) while other users fill its queue.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((host, 0))  # otherwise another computer's address could mean this one's router
+    with socket.socket(family(host), socket.SOCK_DGRAM) as probe:
+        probe.bind(socket_address(host, 0))  # otherwise another computer's address could mean this one's router
     connection = socket.socket(socket.AF_UNIX)
     try:
         seconds = patience or 0.0  # 0: without limit
@@ -55,7 +58,7 @@ def connect(host: str, port: int, patience: float | None) -> socket.socket:
         try:
             connection.connect(_name(host, port))
         except ConnectionRefusedError:
-            connection.connect(_name("0.0.0.0", port))
+            connection.connect(_name(any_of(host), port))
         connection.settimeout(patience)
     except BaseException:
         connection.close()

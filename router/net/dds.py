@@ -44,7 +44,7 @@ def clashes(program: CompiledTable, variables: Mapping[str, str]) -> Iterator[Cl
     for name, gateway in program.table.gateways.items():
         addresses += [(f"gateway '{name}'", gateway.receive)] if gateway.receive is not None else []
     for owner, address in addresses:
-        if is_of_ros(address.value.port, variables):
+        if not address.value.is_ipv6 and is_of_ros(address.value.port, variables):  # DDS has the IPv4 port
             blinds = address.value.port == _FIRST + _OF_DOMAIN * domain
             yield Clash(owner, address.span, address.value, domain, blinds)
 

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 from router.errors import SourceSpan
 from router.log import FloodLog, logger
+from router.net.addresses import family, socket_address
 from router.net.kernel import why_not_bound
-from router.table.addresses import Address
+from router.table.addresses import Address, IPNetwork
 
-_LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
+_LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:.]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
 """IP addresses, and names that nobody can register on the internet."""
 
 
@@ -23,7 +24,7 @@ def listen(address: Address, span: SourceSpan, what: str, key: str) -> socket.so
     `key` is that of the address in a table.
     """
     try:
-        return socket.create_server(address, backlog=256)
+        return socket.create_server(socket_address(*address), family=family(address.host), backlog=256)
     except OSError as error:
         kind, why, _ = why_not_bound("tcp", address.port, error)
         raise kind(f"{span}: cannot serve {what} at {address}: {why}", f"choose another {key}") from error
@@ -55,7 +56,7 @@ class Door:
     Counts refused connections in `refused`, under `server`, and logs each address once. Use it in one thread.
     """
 
-    def __init__(self, server: str, networks: Sequence[ipaddress.IPv4Network], refused: Counter[str]) -> None:
+    def __init__(self, server: str, networks: Sequence[IPNetwork], refused: Counter[str]) -> None:
         self._server = server
         self._networks = networks
         self._refused = refused
@@ -66,7 +67,7 @@ class Door:
         """Return whether a client at IP address `peer`, connected to our address `own`, may connect."""
         if not self._networks or is_own_computer(peer, own):
             return True
-        if any(ipaddress.IPv4Address(peer) in network for network in self._networks):
+        if any(ipaddress.ip_address(peer) in network for network in self._networks):
             return True
         self._refused[self._server] += 1
         event = "connection refused: the client's address is not in a network of 'from'"

@@ -13,6 +13,7 @@ from contextlib import suppress
 from functools import cache
 
 from router.clock import wall_ns
+from router.hosts import bracketed
 from router.log import logger
 
 TYPE_CHECKING = False
@@ -32,6 +33,8 @@ IP_PMTUDISC_DONT = 0
 IP_RECVERR = 11
 IP_FREEBIND = 15
 IP_MULTICAST_ALL = 49
+IPV6_RECVERR = 25
+IPV6_MULTICAST_ALL = 29
 SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
 SIOCGIFADDR = 0x8915
@@ -44,6 +47,9 @@ _MEMINFO_DROPS = 8
 FIRST_OF_ROS = 7000
 """The lowest UDP port that ROS takes (`net.dds`)."""
 BELOW_ROS = f"choose a port below {FIRST_OF_ROS}, here and in what sends to it"
+
+_LINK_LOCAL = "20"
+"""The scope of link-local addresses in /proc/net/if_inet6."""
 
 _INODE = 9
 """Column of the inode in /proc/net/udp and /proc/net/tcp."""
@@ -75,7 +81,7 @@ def discard_unstamped(opened: socket.socket) -> None:
     if count:
         logger.warning(
             "datagrams of unknown age waited in an inherited socket and were discarded",
-            address="{}:{}".format(*opened.getsockname()),
+            address=f"{bracketed(opened.getsockname()[0])}:{opened.getsockname()[1]}",
             datagrams=count,
             remedy="write Timestamping=ns in its socket unit",
         )
@@ -151,12 +157,15 @@ def bound_interface(opened: socket.socket) -> str | None:
 def report_sending_errors(opened: socket.socket) -> None:
     """Have the kernel report ICMP errors about datagrams sent from the socket's port."""
     opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
+    if opened.family == socket.AF_INET6:
+        opened.setsockopt(socket.IPPROTO_IPV6, IPV6_RECVERR, 1)
 
 
 def allow_fragments(opened: socket.socket) -> None:
-    """Clear "don't fragment" in the datagrams that a socket sends.
+    """Clear "don't fragment" in the IPv4 datagrams that a socket sends.
 
     By default Linux sets it and learns a path's MTU from ICMP errors: where those are filtered, large datagrams vanish.
+    IPv6 has no such flag: only the sender fragments, to the MTU that it has learned.
     """
     opened.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, IP_PMTUDISC_DONT)
 
@@ -174,10 +183,24 @@ def interface_is_up(name: str) -> bool | None:
     return None if answer is None else bool(int.from_bytes(answer[:2], "little") & IFF_UP)
 
 
-def interface_address(name: str) -> str | None:
-    """Return the first IPv4 address of a network interface, or None."""
+def interface_address(name: str, family: socket.AddressFamily = socket.AF_INET) -> str | None:
+    """Return the first IPv4 or IPv6 address of a network interface, or None. A link-local one only without another."""
+    if family == socket.AF_INET6:
+        return next((host for _, host in sorted(_ipv6_addresses(name))), None)
     answer = _ask_interface(name, SIOCGIFADDR)
     return None if answer is None else socket.inet_ntoa(answer[4:8])
+
+
+def _ipv6_addresses(interface: str) -> Iterator[tuple[bool, str]]:
+    """Yield whether it is link-local, and the address, for each IPv6 address of a network interface."""
+    from pathlib import Path
+
+    with suppress(FileNotFoundError):  # a kernel without IPv6
+        for row in Path("/proc/net/if_inet6").read_text().splitlines():
+            address, _, _, scope, _, name = row.split()
+            if name == interface:
+                host = socket.inet_ntop(socket.AF_INET6, bytes.fromhex(address))
+                yield scope == _LINK_LOCAL, f"{host}%{name}" if scope == _LINK_LOCAL else host
 
 
 def _ask_interface(name: str, request: int) -> bytes | None:

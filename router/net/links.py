@@ -26,6 +26,7 @@ _MEANINGS: Mapping[int, tuple[str, str]] = {
     errno.ECONNREFUSED: ("nothing listens there", "start its program, or correct `connect`"),
     errno.EADDRINUSE: ("another process has the port of the server", "`ss -ltnp` names it"),
     errno.EADDRNOTAVAIL: ("the server's address does not exist here", "`ip -br address` shows those that do"),
+    errno.ENONET: ("its network interface is not there", "check plug and name: `ip -br link` shows those that are"),
     errno.ETIMEDOUT: ("it does not answer", "check its power and network"),
     **dict.fromkeys(
         (errno.EHOSTUNREACH, errno.ENETUNREACH),

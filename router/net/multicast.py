@@ -1,5 +1,7 @@
 """Multicast: groups that listening sockets join, and how sockets send to groups, by the index of a network interface.
 
+A socket takes groups of its own address family only.
+
 A head start uses this, so it imports only small modules.
 """
 
@@ -10,7 +12,9 @@ import socket
 import struct
 from collections.abc import Collection
 
-from router.net.kernel import IP_MULTICAST_ALL
+from router.hosts import is_ipv6, packed
+from router.net.addresses import family, interface_index
+from router.net.kernel import IP_MULTICAST_ALL, IPV6_MULTICAST_ALL
 
 # Of <linux/netlink.h> and <linux/rtnetlink.h>.
 _RTM_NEWROUTE, _RTM_GETROUTE = 24, 26
@@ -21,14 +25,19 @@ _ROUTE = struct.Struct("=8BI")
 _ATTRIBUTE = struct.Struct("=HH")
 _INDEX = struct.Struct("=I")
 
+_OF_IPV4 = socket.IPPROTO_IP, IP_MULTICAST_ALL, socket.IP_ADD_MEMBERSHIP, socket.IP_DROP_MEMBERSHIP
+_OF_IPV6 = socket.IPPROTO_IPV6, IPV6_MULTICAST_ALL, socket.IPV6_JOIN_GROUP, socket.IPV6_LEAVE_GROUP
+"""The level of the options of groups, and the options: receive all groups, join one, and leave one."""
+
 NO_INTERFACE = "there is no such network interface"
 NO_ROUTE = "no route leads to the group, and no interface is named for it"
 
 
 def route_index(host: str) -> int | None:
-    """Return the index of the network interface to which the routes of this computer send an IPv4 address, or None."""
-    attribute = _ATTRIBUTE.pack(_ATTRIBUTE.size + 4, _RTA_DST) + socket.inet_aton(host)
-    body = _ROUTE.pack(socket.AF_INET, 32, 0, 0, 0, 0, 0, 0, 0) + attribute
+    """Return the index of the network interface to which the routes of this computer send an IP address, or None."""
+    address = packed(host)
+    attribute = _ATTRIBUTE.pack(_ATTRIBUTE.size + len(address), _RTA_DST) + address
+    body = _ROUTE.pack(family(host), 8 * len(address), 0, 0, 0, 0, 0, 0, 0) + attribute
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asking:
         asking.send(_HEADER.pack(_HEADER.size + len(body), _RTM_GETROUTE, _NLM_F_REQUEST, 1, 0) + body)
         answer = asking.recv(4096)
@@ -42,14 +51,6 @@ def route_index(host: str) -> int | None:
             return int(_INDEX.unpack_from(answer, at + _ATTRIBUTE.size)[0])
         at += (size + 3) & ~3
     return None
-
-
-def interface_index(name: str) -> int | None:
-    """Return the index of a network interface, or None. One that was removed and has come back has another index."""
-    try:
-        return socket.if_nametoindex(name)
-    except OSError:
-        return None
 
 
 def _is_interface(index: int) -> bool:
@@ -72,13 +73,19 @@ def aim(opened: socket.socket, interface: str | None, hops: int, is_looped: bool
     removed and has come back, do this again. `hops` is the number of networks that a datagram may pass. `is_looped`:
     also to sockets of this computer.
     """
+    is_v6 = opened.family == socket.AF_INET6  # may nevertheless send to an IPv4 group
     opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hops)
     opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, is_looped)
+    if is_v6:
+        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, hops)
+        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_LOOP, is_looped)
     if interface is None:
         return True
     if (index := interface_index(interface)) is None:
         return False
     opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _membership("0.0.0.0", index))
+    if is_v6:
+        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, index)
     return True
 
 
@@ -90,6 +97,8 @@ class Groups:
 
     def __init__(self, opened: socket.socket, interface: str | None) -> None:
         self._socket = opened
+        is_v6 = opened.family == socket.AF_INET6
+        self._level, self._every, self._add, self._drop = _OF_IPV6 if is_v6 else _OF_IPV4
         self._interface = interface
         self._joined: dict[str, int] = {}
         self.missing: dict[str, str] = {}
@@ -97,7 +106,7 @@ class Groups:
     def follow(self, wanted: Collection[str]) -> None:
         """Join the `wanted` groups that are not joined on their interfaces, and leave the others. Raises OSError."""
         # Otherwise the socket also gets the groups that other programs have joined.
-        self._socket.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0 if wanted else 1)
+        self._socket.setsockopt(self._level, self._every, 0 if wanted else 1)
         for group in self._joined.keys() - wanted:
             self._leave(group)
         missing = {group: self._join(group) for group in wanted}
@@ -117,7 +126,7 @@ class Groups:
         if joined is not None:
             self._leave(group)
         try:
-            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, _membership(group, index))
+            self._socket.setsockopt(self._level, self._add, _membership(group, index))
         except OSError as error:
             if error.errno != errno.EADDRINUSE:  # the socket was inherited with it
                 return error.strerror or str(error)
@@ -126,9 +135,10 @@ class Groups:
 
     def _leave(self, group: str) -> None:
         membership = _membership(group, self._joined.pop(group))
-        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, membership)
+        self._socket.setsockopt(self._level, self._drop, membership)
 
 
 def _membership(group: str, index: int) -> bytes:
-    """Return a struct ip_mreqn."""
-    return socket.inet_aton(group) + bytes(4) + struct.pack("@i", index)
+    """Return a struct ip_mreqn, or a struct ipv6_mreq."""
+    between = 0 if is_ipv6(group) else 4
+    return packed(group) + bytes(between) + struct.pack("@i", index)

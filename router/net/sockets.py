@@ -1,5 +1,7 @@
 """UDP sockets, opened with plain values: listeners, also inherited ones, and sockets to send from.
 
+An IPv6 socket takes no IPv4: listeners at `::` and at `0.0.0.0` can have the same port.
+
 A head start opens them before anything else is loaded, so settings, findings and messages are in `net.udp`.
 """
 
@@ -12,6 +14,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapp
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 
+from router.hosts import ANY_HOST, ANY_IPV6, is_address, is_any, is_ipv6, loopback_of, zone
+from router.net.addresses import bound_address, open_socket, socket_address
 from router.net.kernel import (
     IP_FREEBIND,
     IP_MULTICAST_ALL,
@@ -46,6 +50,10 @@ BOARD_ROOM = 8192
 """Requested send buffer of a board, in bytes: the kernel queues commands until it knows the hardware address.
 It grants twice as much, which holds about 20 small datagrams, so that a burst of 16 is queued without loss."""
 
+_MAPPED = "::ffff:"
+_NOBODY = "ff00::"
+"""A multicast address that is never assigned (RFC 4291, 2.7.1)."""
+
 FIRST_INHERITED = 3
 """The first descriptor that a service manager passes; the others follow it."""
 
@@ -75,11 +83,11 @@ class Inherited:
 
 
 def _is_bound_to(held: socket.socket, address: tuple[str, int], interface: str | None) -> bool:
-    return is_udp(held) and held.getsockname() == address and bound_interface(held) == (interface or "")
+    return is_udp(held) and bound_address(held) == address and bound_interface(held) == (interface or zone(address[0]))
 
 
 def is_udp(held: socket.socket) -> bool:
-    return (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM)
+    return held.family in (socket.AF_INET, socket.AF_INET6) and held.type == socket.SOCK_DGRAM
 
 
 @cache
@@ -104,7 +112,7 @@ ABSENT = {
     errno.ENODEV: ("there is no such network interface", "run `ip link` to list the interfaces"),
     errno.EADDRNOTAVAIL: (
         "no network interface of this computer has that address",
-        "use 0.0.0.0 to listen on all of them",
+        "use 0.0.0.0 (for IPv6, [::]) to listen on all of them",
     ),
     errno.ENETDOWN: ("the network is down", "run `ip link` to see which interface is"),
 }
@@ -115,7 +123,12 @@ def bind(opened: socket.socket, address: tuple[str, int], interface: str | None)
     """Bind a socket to an address, and to a network interface unless None. Raises OSError."""
     if interface is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
-    opened.bind(address)
+    opened.bind(socket_address(*address))
+
+
+def open_udp(host: str) -> socket.socket:
+    """Return a new UDP socket of the family of a host. An IPv6 one takes no IPv4."""
+    return open_socket(host, socket.SOCK_DGRAM)
 
 
 class ListeningSocket:
@@ -139,7 +152,7 @@ class ListeningSocket:
     ) -> None:
         handed_over = inherited().take(address, interface)
         self.is_inherited = handed_over is not None
-        self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket = handed_over or open_udp(address[0])
         self.interface = interface
         self.address = address
         self.wanted = address, interface
@@ -170,7 +183,7 @@ class ListeningSocket:
                 raise
             self.is_waiting = True
         else:
-            self.address = self.socket.getsockname()
+            self.address = self.address[0], self.socket.getsockname()[1]
 
     def request_receive_buffer(self, size: int) -> None:
         """Request a buffer. An inherited socket keeps a larger one, for datagrams that arrive between processes."""
@@ -206,8 +219,8 @@ class ListeningSocket:
 
         Thread-safe; false for a closed socket.
         """
-        is_lost = self.interface is not None and bound_interface(self.socket) is None
-        return is_lost and self.socket.fileno() >= 0
+        is_lost = (self.interface is not None or zone(self.address[0])) and bound_interface(self.socket) is None
+        return bool(is_lost) and self.socket.fileno() >= 0
 
     @contextmanager
     def shared(self) -> Iterator[None]:
@@ -233,7 +246,7 @@ class ListeningSocket:
         # If the interface has lost the address, connecting fails, but nothing arrives and shutting down still wakes.
         if not self.is_waiting:
             with suppress(OSError):
-                self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
+                self.socket.connect(socket_address(loopback_of(host) if is_any(host) else host, port))
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RD)
 
@@ -248,14 +261,18 @@ def placed(source: Source | None, every: Iterable[Source]) -> Source | None:
 
 
 def open_sending(
-    source: ListeningSocket | None, listening: Collection[ListeningSocket] = (), *, is_board: bool = False
+    source: ListeningSocket | None,
+    listening: Collection[ListeningSocket] = (),
+    *,
+    is_board: bool = False,
+    host: str = ANY_HOST,
 ) -> socket.socket:
-    """Open a non-blocking, unconnected socket for one destination. It receives nothing.
+    """Open a non-blocking, unconnected socket for one destination, which is `host`. It receives nothing.
 
     It is bound to address and port of `source`, so that replies reach that listener; without one, or while it is
     waiting, the kernel chooses the port. `listening` are all open listeners, which must allow it. Raises OSError.
     """
-    opened = _open_free() if source is None or source.is_waiting else _open_beside(source, listening)
+    opened = _open_free(host) if source is None or source.is_waiting else _open_beside(source, listening)
     if is_board:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BOARD_ROOM)
     return opened
@@ -263,27 +280,37 @@ def open_sending(
 
 def is_beside(opened: socket.socket) -> bool:
     """Return whether a socket sends from the port of a listener."""
-    return opened.family == socket.AF_INET6
+    return str(opened.getsockname()[0]).startswith((_MAPPED, _NOBODY))
 
 
 def leaves_from(opened: socket.socket) -> str:
-    """Return the source address of a sending socket; 0.0.0.0 if the kernel chooses one for each datagram."""
-    return str(opened.getsockname()[0]).removeprefix("::ffff:")
+    """Return the source address of a sending socket, without an interface; 0.0.0.0 or :: if the kernel chooses one for
+    each datagram.
+    """
+    host = str(opened.getsockname()[0])
+    if host != _NOBODY:
+        return host.removeprefix(_MAPPED)
+    try:
+        return str(opened.getpeername()[0])
+    except OSError:  # it is not connected
+        return ANY_IPV6
 
 
 def address_beside(source: ListeningSocket, listening: Iterable[ListeningSocket]) -> tuple[str, int]:
-    """Return the address to bind a socket that sends from a listener's port.
+    """Return the address that a socket has which sends from a listener's port.
 
-    If another listener has all addresses of another interface, a socket with a specific address would receive its
+    If another listener has all addresses of another interface, an IPv4 socket with a specific address would receive its
     datagrams: Linux prefers such sockets.
     """
-    everywhere = "0.0.0.0", source.address[1]
+    everywhere = ANY_HOST, source.address[1]
+    if is_ipv6(source.address[0]):
+        return source.address
     return everywhere if any(listener.address == everywhere for listener in listening) else source.address
 
 
-def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
-    """Open a socket that reports ICMP errors and receives nothing."""
-    opened = socket.socket(family, socket.SOCK_DGRAM)
+def _open_free(host: str) -> socket.socket:
+    """Open a socket for a host, also for a name, that reports ICMP errors and receives nothing."""
+    opened = open_udp(host) if is_address(host) else _open_for_either()
     opened.setblocking(False)
     allow_fragments(opened)
     report_sending_errors(opened)
@@ -291,25 +318,54 @@ def _open_free(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
     return opened
 
 
+def _open_for_either() -> socket.socket:
+    """Open a socket that sends to IPv4 and IPv6 hosts; to IPv4 ones only, where the kernel has no IPv6."""
+    try:
+        opened = socket.socket(socket.AF_INET6, socket.SOCK_DGRAM)
+    except OSError as error:
+        if error.errno != errno.EAFNOSUPPORT:
+            raise
+        return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+    return opened
+
+
 def _open_beside(source: ListeningSocket, listening: Collection[ListeningSocket]) -> socket.socket:
     """Open a socket that sends from a listener's address and port, while only the listener receives.
 
-    It is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux prefers the
-    one with the datagram's address family.
+    For IPv4, it is an IPv6 socket with an IPv4 address: of two sockets that match a datagram or an ICMP error, Linux
+    prefers the one with the datagram's address family. For IPv6, it is bound to a multicast address, to which nothing
+    is sent: Linux then chooses the source address.
     """
-    opened = _open_free(socket.AF_INET6)
+    host, port = address_beside(source, listening)
+    opened = _open_free(ANY_IPV6)
     try:
-        opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        opened.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)  # otherwise it gets a copy of what groups get
-        opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        host, port = address_beside(source, listening)
+        if not is_ipv6(host):
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            opened.setsockopt(socket.IPPROTO_IP, IP_MULTICAST_ALL, 0)  # otherwise it gets a copy of what groups get
+            opened.setsockopt(socket.IPPROTO_IP, IP_FREEBIND, 1)  # as an inherited listener may have been
         with ExitStack() as shared:
             for listener in listening:
                 if listener.address[1] == port:
                     shared.enter_context(listener.shared())
-            opened.bind((f"::ffff:{host}", port))
+            opened.bind((_NOBODY if is_ipv6(host) else f"{_MAPPED}{host}", port))
+        settle(opened, source)
     except OSError:
         opened.close()
         raise
     return opened
+
+
+def settle(opened: socket.socket, source: ListeningSocket) -> None:
+    """Have a socket from `open_sending` send from the IPv6 address of its listener, if this computer has that now.
+
+    Connecting selects the source address; the socket can still send to any address.
+    """
+    host, port = source.address
+    if not is_ipv6(host) or is_any(host):
+        return
+    # An inherited socket may have an address that is not there: connecting would select another one.
+    with suppress(OSError), socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+        probe.bind(socket_address(host, 0))
+        opened.connect(socket_address(host, port))

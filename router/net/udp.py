@@ -7,10 +7,11 @@ import socket
 from collections.abc import Collection, Mapping
 
 from router.errors import StartError
+from router.hosts import zone
 from router.log import logger
 from router.net import sockets
+from router.net.addresses import bound_address, interface_index, socket_address
 from router.net.kernel import bound_interface, drops, why_not_bound
-from router.net.multicast import interface_index
 from router.net.sockets import ABSENT, ListeningSocket
 from router.table.addresses import Address, not_one_machine
 from router.table.model import endpoints
@@ -24,18 +25,21 @@ def unclaimed() -> list[str]:
 
 def _described(held: socket.socket) -> str:
     if not sockets.is_udp(held):
-        return f"{held.getsockname()}, which is not an IPv4 UDP socket"
+        return f"{held.getsockname()}, which is not a UDP socket"
     interface = bound_interface(held)
-    return bound_to(Address(*held.getsockname()), "an interface that has gone" if interface is None else interface)
+    address = Address(*bound_address(held))
+    if interface == zone(address.host):
+        interface = ""
+    return bound_to(address, "an interface that has gone" if interface is None else interface)
 
 
 def absence(address: Address, interface: str | None) -> tuple[str, str] | None:
     """Return why a listener must wait for its address or interface, with a remedy; None if it need not."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
+    try:
+        with sockets.open_udp(address.host) as probe:
             sockets.bind(probe, address, interface)
-        except OSError as error:
-            return ABSENT.get(error.errno or 0)
+    except OSError as error:
+        return ABSENT.get(error.errno or 0)
     return None
 
 
@@ -70,6 +74,7 @@ class Listener:
         self.is_inherited = self.opened.is_inherited
         self.is_waiting = self.opened.is_waiting
         self._check_receive_buffer()
+        self._check_family()
         self._log_groups({})
         self._drops_at_close = 0
 
@@ -161,6 +166,15 @@ class Listener:
                 remedy=f"sysctl -w net.core.rmem_max={requested}",
             )
 
+    def _check_family(self) -> None:
+        if self.address.is_ipv6 and not self.socket.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY):
+            logger.warning(
+                "an inherited IPv6 socket also has the IPv4 port: what it receives there is rejected",
+                listener=self.name,
+                address=str(self.address),
+                remedy="write BindIPv6Only=ipv6-only in its socket unit",
+            )
+
 
 def _refused(settings: endpoints.Listener, error: OSError) -> StartError:
     kind, why, hint = why_not_bound("udp", settings.address.value.port, error)
@@ -170,11 +184,6 @@ def _refused(settings: endpoints.Listener, error: OSError) -> StartError:
     return kind(f"{settings.address.span}: {what}: {why}", hint)
 
 
-def addresses_of(host: str) -> list[str]:
-    """Return the IPv4 addresses of a host name. It may take as long as the resolver does. Raises OSError."""
-    return [str(found[4][0]) for found in socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)]
-
-
 def nobody_listens(address: Address) -> str:
     """Return the meaning of "Connection refused" for UDP: the computer answers, but no process has the port."""
     return f"nobody listens at {address}"
@@ -182,11 +191,9 @@ def nobody_listens(address: Address) -> str:
 
 def why_not_sent(error: OSError, address: Address) -> str:
     """Describe why nothing was sent to an address, with a command that shows more."""
-    if address.is_learned:
-        return "its address is not learned: nobody has sent a message for a route with this source"
-    if address.is_name:
-        return f"the host name {address.host} is not resolved: `getent ahostsv4 {address.host}`"
-    ask = f"`ip route get {address.host}`"
+    if address.is_name or address.is_learned:
+        return _why_no_address(address)
+    ask = f"`{_ask_routes(address.host)}`"
     match error.errno:
         case errno.ECONNREFUSED:
             return nobody_listens(address)
@@ -198,9 +205,25 @@ def why_not_sent(error: OSError, address: Address) -> str:
             return f"no route leads to {address.host}, or it does not answer: {ask}"
         case errno.EBADF | errno.ENODEV:
             return f"the network interface through which {address.host} is reached is missing: `ip link`"
+        case errno.EADDRNOTAVAIL:
+            return f"this computer has no address from which it can send to {address.host}: `ip address`"
+        case errno.EINVAL if zone(address.host):
+            return f"the network interface {zone(address.host)} is missing: `ip link`"
         case errno.EINVAL:
             return f"the routes of this computer discard datagrams to {address.host}: {ask}"
     return error.strerror or str(error)
+
+
+def _why_no_address(address: Address) -> str:
+    if address.is_learned:
+        return "its address is not learned: nobody has sent a message for a route with this source"
+    return f"the host name {address.host} is not resolved: `getent ahosts {address.host}`"
+
+
+def _ask_routes(host: str) -> str:
+    """Return the command that shows the route to an IP address."""
+    bare, _, interface = host.partition("%")
+    return f"ip route get {bare}{f' oif {interface}' if interface else ''}"
 
 
 def why_unreachable(address: Address) -> tuple[str, str] | None:
@@ -208,19 +231,21 @@ def why_unreachable(address: Address) -> tuple[str, str] | None:
 
     Raises BadAddressError for a broadcast address, which depends on the computer's interfaces.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(address)  # sends nothing
-        except OSError as error:
-            if error.errno == errno.EACCES and _is_broadcast(address):
-                raise not_one_machine(address) from error
-            if error.errno == errno.ENETUNREACH:
-                return (
-                    "no route leads there",
-                    "check the cable, and that `ip address` shows an interface in its network",
-                )
-            why = error.strerror.lower() if error.strerror else str(error)
-            return f"the kernel refuses it: {why}", f"run `ip route get {address.host}` to see which route refuses it"
+    try:
+        with sockets.open_udp(address.host) as probe:
+            probe.connect(socket_address(*address))  # sends nothing
+    except OSError as error:
+        if error.errno == errno.EACCES and not address.is_ipv6 and _is_broadcast(address):
+            raise not_one_machine(address) from error
+        if error.errno in (errno.ENETUNREACH, errno.EADDRNOTAVAIL):
+            return (
+                "no route leads there",
+                "check the cable, and that `ip address` shows an interface in its network",
+            )
+        if error.errno == errno.ENODEV:
+            return ABSENT[errno.ENODEV]
+        why = error.strerror.lower() if error.strerror else str(error)
+        return f"the kernel refuses it: {why}", f"run `{_ask_routes(address.host)}` to see which route refuses it"
     return None
 
 
@@ -233,9 +258,13 @@ def why_no_way(endpoint: endpoints.Endpoint) -> tuple[str, str] | None:
 
 
 def usual_source(address: Address) -> str | None:
-    """Return the source address of the route to an address; None if there is no route."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        return str(probe.getsockname()[0]) if probe.connect_ex(address) == 0 else None
+    """Return the source address of the route to an address, without an interface; None if there is no route."""
+    try:
+        with sockets.open_udp(address.host) as probe:
+            probe.connect(socket_address(*address))
+            return str(probe.getsockname()[0])
+    except OSError:
+        return None
 
 
 def _is_broadcast(address: Address) -> bool:
@@ -252,10 +281,10 @@ def open_sending(
 
     `listening` are all open listeners. Raises OSError if descriptors run out.
     """
-    is_board = endpoint.kind is endpoints.EndpointKind.BOARD
+    is_board, host = endpoint.kind is endpoints.EndpointKind.BOARD, endpoint.address.value.host
     if source is not None:
         try:
-            return sockets.open_sending(source.opened, listening, is_board=is_board)
+            return sockets.open_sending(source.opened, listening, is_board=is_board, host=host)
         except OSError as error:
             logger.warning(
                 "datagrams to this endpoint do not leave from its listener's port; replies to them are lost",
@@ -263,4 +292,4 @@ def open_sending(
                 listener=source.name,
                 why=error.strerror,
             )
-    return sockets.open_sending(None, is_board=is_board)
+    return sockets.open_sending(None, is_board=is_board, host=host)

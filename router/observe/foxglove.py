@@ -29,6 +29,7 @@ from websockets.typing import Subprotocol
 from router.clock import wall_ns
 from router.compiler.compiled_table import CompiledTable
 from router.log import FloodLog, fault, logger_of_library
+from router.net.addresses import bound_address
 from router.net.doors import Door, is_foreign, listen
 from router.observe.running import Running
 from router.recording.channels import descriptor_set
@@ -142,7 +143,7 @@ class FoxgloveServer:
         self._view = self._view_of(running.program)
         self._session = str(wall_ns())
         listening = listen(settings.address.value, settings.address.span, "Foxglove", "foxglove.address")
-        self.address = Address(*listening.getsockname())
+        self.address = Address(*bound_address(listening))
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._changed = asyncio.Event()

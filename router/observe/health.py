@@ -326,11 +326,11 @@ class HealthSnapshot:
                 if lost := self._unsent.get(name):
                     more += f", and does not answer: {self._amount(lost)} for it lost in {self._span}"
             routes = tuple(route for route, names in self._sources.items() if name in names and names <= silent)
-            problem = self._problem(kind, {"endpoint": name}, more, routes)
+            problem = Problem(kind, {"endpoint": name}, more, self._remedy_for_silence(name), routes)
             if (sender := self._senders.in_place_of(name)) is not None:
                 labels = {"endpoint": name, "sender": sender}
                 problem = problem._replace(labels=labels, more=f"{more}, while {sender} sends its messages")
-            yield problem._replace(remedy=self._remedy_for_silence(name))
+            yield problem
 
     def _remedy_for_silence(self, endpoint: str) -> str:
         address = self._senders.host(endpoint)
@@ -344,7 +344,7 @@ class HealthSnapshot:
             return _SILENT_LINE.format(address=address)
         if not address:
             return _NOT_LEARNED.format(endpoint=endpoint)
-        return Kind.ENDPOINT_SILENT.remedy.format(address=address)
+        return Kind.ENDPOINT_SILENT.remedy_at(address)
 
     @property
     def _span(self) -> str:

@@ -41,6 +41,7 @@ from prometheus_client.exposition import gzip_accepted
 from router.errors import SourceSpan, StartError
 from router.log import FloodLog, fault
 from router.net import control
+from router.net.addresses import bound_address
 from router.net.doors import Door, is_foreign, is_own_computer, listen
 from router.observe.requests import BadRequestError, Request, parse
 from router.observe.responses import PAGES, SAVE, Responder, Response, plain
@@ -104,7 +105,7 @@ class HttpServer:
         responder = Responder(running, health, self._status, save)
         with ExitStack() as opening:
             listening = opening.enter_context(listen(address, span, "HTTP", "http.address"))
-            self.address = Address(*listening.getsockname())
+            self.address = Address(*bound_address(listening))
             controlled = opening.enter_context(_control(self.address, span))
             self._servers = [_Server("http", listening, door, connections, responder)]
             opening.callback(self._servers[0].end)

@@ -15,6 +15,7 @@ from router.clock import boottime_ns
 from router.compiler.compiled_table import CompiledTable
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored
+from router.table.addresses import Address
 from router.threads import Thread
 from router.values.printing import protobuf_json
 
@@ -81,7 +82,7 @@ class LastValues:
             fields = protobuf_json(payload, complete=True)
             self._values[case.name] = {
                 "at": at / 1e9,
-                "source": endpoint or f"{peer[0]}:{peer[1]}",
+                "source": endpoint or str(Address(*peer)),
                 "bytes": len(data),
                 "fields": shortened(fields),
             }

@@ -34,11 +34,16 @@ class Kind(enum.Enum):
     """A kind of problem, in the order in which they are shown: what stops the rover, its causes, other losses.
 
     `words` contain labels of `metric`. There is a problem while its value exceeds `threshold`: for losses per second,
-    for times in seconds. `remedy` can also contain the `{address}` of what the labels name.
+    for times in seconds. `remedy` can also contain the `{address}` of what the labels name, and that address without
+    a zone, `{host}`.
     """
 
     def __init__(self, level: Level, words: str, remedy: str = "", metric: str = "", threshold: float = 0.0) -> None:
         self.level, self.words, self.remedy, self.metric, self.threshold = level, words, remedy, metric, threshold
+
+    def remedy_at(self, address: str) -> str:
+        """Return the remedy for what has an address."""
+        return self.remedy.format(address=address, host=address.partition("%")[0])
 
     ROUTER_DOWN = (Level.CRITICAL, "no router answers at {instance}")
     RECEIVE_STUCK = (
@@ -63,7 +68,7 @@ class Kind(enum.Enum):
     ENDPOINT_UNRESOLVED = (
         Level.CRITICAL,
         "{endpoint} gets nothing: its host name is not resolved",
-        "Check the name with `getent ahostsv4 {address}`, or give {endpoint} its IP address.",
+        "Check the name with `getent ahosts {address}`, or give {endpoint} its IP address.",
         "endpoint_unresolved",
     )
     LINK_CLOSED = (
@@ -93,7 +98,7 @@ class Kind(enum.Enum):
     ENDPOINT_SILENT = (
         Level.WARNING,
         "{endpoint} is silent",
-        "Check its power, cable or radio, and address: `ping {address}`, `tcpdump -n udp and host {address}`.",
+        "Check its power, cable or radio, and address: `ping {address}`, `tcpdump -n udp and host {host}`.",
         "endpoint_silence_seconds",  # the threshold is the endpoint's `stale_after`
     )
     COMMANDS_DROPPED = (

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
 
-from router.compiler.metrics import HISTOGRAM_CELLS, Counters, Metric, origin_text
+from router.compiler.metrics import HISTOGRAM_CELLS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
+from router.net.addresses import origin_text
 from router.observe.snapshot import BUCKETS, SERIES, Counts, Labels
 
 SeriesFunction = Callable[[], Iterable[tuple[Sequence[str], float]]]

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from router.compiler.metrics import Mismatch
+from router.table.addresses import parse_address
 from router.table.model.routes import ANY
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ class Senders:
     def host(self, endpoint: str) -> str:
         """Return the host of an endpoint; "" before it is learned."""
         if self.is_learned(endpoint):
-            return self._learned.get(endpoint, "").rpartition(":")[0]
+            learned = self._learned.get(endpoint)
+            return parse_address(learned).host if learned is not None else ""
         return self._program.table.endpoints[endpoint].address.value.host
 
     def in_place_of(self, endpoint: str) -> str | None:

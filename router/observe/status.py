@@ -8,6 +8,7 @@ from typing import Any
 from router.clock import boottime_ns
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.metrics import INTENDED_REASONS
+from router.hosts import bracketed
 from router.observe.last_values import LastValues
 from router.observe.route_map import deadman_edges, endpoint_node, nodes_and_edges
 from router.observe.running import Running
@@ -189,7 +190,7 @@ def _map_json(program: CompiledTable) -> Json:
         "node": table.node.name,
         "listeners": {name: str(listener.address.value) for name, listener in table.listeners.items()},
         "pages": {
-            gateway.name: list(gateway.address.value)
+            gateway.name: [bracketed(gateway.address.value.host), gateway.address.value.port]
             for gateway in table.gateways.values()
             if gateway.transport.value is Transport.WEBSOCKET and gateway.address is not None
         },

@@ -2,19 +2,18 @@
 
 The stream is MAGIC, then records, each preceded by its length: `<uint32 length> <uint8 kind> ...`, little-endian.
 
-    SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <listener> <endpoint> <reason> <datagram>
+    SEEN   <uint64 wall clock, ns> <uint16 port> <IP address> <listener> <endpoint> <reason> <datagram>
     LOST   <uint64 count>    the number of datagrams not sent, because the reader of the stream is too slow
     ALIVE                    once a second if there is nothing else to send
     ACTED  <uint64 wall clock, ns> <what> <route> <target> <topic> <reason> <detail> <datagram>
 
-Listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16), as are those of
-ACTED, which are the fields of an Action. A datagram longer than the router accepts is cut to one byte more than that.
-A tap that is limited to senders or decisions has no actions; any other has all of them.
+IP address, listener, endpoint and reason, as in MirroredDatagram, are texts preceded by their lengths (uint16), as are
+those of ACTED, which are the fields of an Action. A datagram longer than the router accepts is cut to one byte more
+than that. A tap that is limited to senders or decisions has no actions; any other has all of them.
 """
 
 from __future__ import annotations
 
-import socket
 import struct
 import threading
 from collections import deque
@@ -24,9 +23,11 @@ from typing import NamedTuple
 
 from router.compiler.compiled_table import CompiledTable
 from router.errors import RouterError, TransportError, did_you_mean
+from router.hosts import is_address, is_ipv6
 from router.recording.mirror import Acted, Action, Mirror, Mirrored, MirroredDatagram
+from router.table.addresses import BadAddressError, parse_ipv6
 
-MAGIC = b"router tap 2\n"
+MAGIC = b"router tap 3\n"
 CONTENT_TYPE = "application/x-router-tap"
 
 SEEN, LOST, ALIVE, ACTED = 1, 2, 3, 4
@@ -39,7 +40,7 @@ ALIVE_SECONDS = 1.0
 _LENGTH = struct.Struct("<I")
 _SEEN = struct.Struct("<IBQ")
 _LOST = struct.Struct("<IBQ")
-_PEER = struct.Struct("<4sH")
+_PORT = struct.Struct("<H")
 _TEXT = struct.Struct("<H")
 _LONGEST = 1 << 20
 
@@ -61,7 +62,7 @@ def wanted(
     """Return a filter for datagrams of these payload cases, sources and decisions; None if all are wanted.
 
     A datagram that does not begin with the field of a payload case always passes: only a decoder can classify it. A
-    source is an endpoint or an IPv4 address. Raises TapRequestError.
+    source is an endpoint or an IP address, in any form. Raises TapRequestError.
     """
     conditions = [
         *([_of_decision(decisions)] if decisions else []),
@@ -99,9 +100,12 @@ def _of_case(program: CompiledTable, cases: Sequence[str]) -> Wanted:
 
 def _from_source(program: CompiledTable, sources: Sequence[str]) -> Wanted:
     endpoints = program.table.endpoints
-    if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
+    if unknown := [name for name in sources if name not in endpoints and not is_address(name)]:
         raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")
-    names = frozenset(sources)
+    try:
+        names = frozenset(parse_ipv6(source) if is_ipv6(source) else source for source in sources)
+    except BadAddressError as error:
+        raise TapRequestError(f"{error.what}; {error.hint}") from error
 
     def is_wanted(datagram: Mirrored) -> bool:
         _, _, peer, endpoint, *_ = datagram
@@ -191,7 +195,7 @@ def encode_alive() -> bytes:
 
 @lru_cache(1024)
 def _head(listener: str, peer: tuple[str, int], *texts: str) -> bytes:
-    return _PEER.pack(socket.inet_aton(peer[0]), peer[1]) + _texts(listener, *texts)
+    return _PORT.pack(peer[1]) + _texts(peer[0], listener, *texts)
 
 
 def _texts(*texts: str) -> bytes:
@@ -241,9 +245,9 @@ def _record(record: bytes) -> Iterator[MirroredDatagram | Action | Lost]:
         yield Lost(int.from_bytes(record[1:9], "little"))
     elif record[0] == SEEN:
         at = int.from_bytes(record[1:9], "little")
-        host, port = _PEER.unpack_from(record, 9)
-        (listener, endpoint, reason), data = _read_texts(record, 9 + _PEER.size, 3)
-        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), endpoint, reason, data)
+        (port,) = _PORT.unpack_from(record, 9)
+        (host, listener, endpoint, reason), data = _read_texts(record, 9 + _PORT.size, 4)
+        yield MirroredDatagram(at, listener, (host, port), endpoint, reason, data)
     elif record[0] == ACTED:
         (what, route, target, topic, reason, detail), data = _read_texts(record, 9, 6)
         yield Action(int.from_bytes(record[1:9], "little"), what, route, target, topic, reason, detail, data)

@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from router.datagrams import Peer
+from router.table.addresses import Address
 from router.types.protobuf import PayloadCase
 
 DATAGRAMS = "raw/datagrams"
@@ -63,7 +64,7 @@ class Channels:
 
     def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str, reason: str) -> int | None:
         """Return the channel of a payload; None if there are too many. `endpoint`, `reason`: as in MirroredDatagram."""
-        sender = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
+        sender = {"listener": listener, "peer": str(Address(*peer)), "endpoint": endpoint}
         topic, metadata = _decided(case.name, {**_metadata(case, Holds.PAYLOAD), **sender}, reason)
         if len(self.channels) >= MOST_CHANNELS and self._key(topic, _payload(case), metadata) not in self._channel_ids:
             return None
@@ -170,7 +171,7 @@ _TEXT, _BYTES = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTE
 
 DATAGRAM = _own_message("Datagram", listener=_TEXT, peer=_TEXT, data=_BYTES, endpoint=_TEXT)
 Datagram = GetMessageClass(DATAGRAM)
-"""`peer` is HOST:PORT, `data` the bytes as received, `endpoint` the sender's name in the table.
+"""`peer` is HOST:PORT, as `Address` writes it, `data` the bytes as received, `endpoint` the sender's name in the table.
 
 Like an Event, it may have a field `envelope` (see `Whole`).
 """

@@ -14,6 +14,7 @@ from router.declared import MAX_DATAGRAM
 from router.recording.beside import Whole
 from router.recording.channels import Channels, Event, Holds
 from router.recording.mirror import BRAKED, SENT, Acted, Action, Classifier, Format, Mirrored, Taken
+from router.table.addresses import Address
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import varint
 
@@ -181,7 +182,7 @@ class Encoder:
         """Yield channel and message of a datagram, and of its payloads."""
         payloads = classifier.encoded_payloads(listener, data)
         whole = self._whole(classifier.at(listener).envelope)
-        texts = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
+        texts = {"listener": listener, "peer": str(Address(*peer)), "endpoint": endpoint}
         datagram = whole.datagram(data if payloads else b"", data=data, **texts)
         yield self._channels.datagrams(whole.datagram_type, whole.label, reason), datagram
         for case, payload in payloads:

@@ -307,7 +307,7 @@ class Classifier:
         self._trimming = frozenset(
             listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
         )
-        self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
+        self._recognisers = {name: recognisers(table, name) for name in table.listeners}
 
     def at(self, listener: str) -> Format:
         """Return the format of what a listener receives."""

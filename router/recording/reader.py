@@ -220,4 +220,4 @@ def _event(at: int, message: bytes) -> Action:
 
 def _peer(text: str) -> Peer:
     host, _, port = text.rpartition(":")
-    return host, int(port)
+    return host.removeprefix("[").removesuffix("]"), int(port)

@@ -5,6 +5,7 @@ Every name must be in the table under test; otherwise InvalidValueError is raise
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,13 +16,14 @@ from router.compiler.checked import CheckedCalled, CheckedService
 from router.compiler.compiled_table import CompiledTable, StatePlan, is_service, service_label
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
-from router.compiler.network import sent_by
-from router.compiler.resolution import stand_in
+from router.compiler.network import takes_from
+from router.compiler.resolution import PORT_IN_TESTS, sender_in_tests
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
+from router.hosts import LOOPBACK, bracketed
 from router.rehearsal.fields import ANY, FieldReader, Fields
 from router.rehearsal.stage import UNMATCHED
-from router.table.addresses import BadAddressError, parse_address
+from router.table.addresses import BadAddressError, is_host, parse_address
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
@@ -125,12 +127,6 @@ class Step:
 # Names
 
 
-_PORT = 40_000
-"""A sender's port if the test gives none."""
-_LEARNED_HOST = "198.19.0.1"
-"""The host of endpoints whose address is learned, unless their networks exclude it: one for benchmarks."""
-
-
 class Names:
     """The names of a table. Methods take a name and its place, and raise InvalidValueError for an unknown name."""
 
@@ -168,15 +164,12 @@ class Names:
         return self._program.envelopes.to(endpoint).beside
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
-        """Return the address that an endpoint sends from, or an address written HOST:PORT."""
+        """Return the address that an endpoint sends from, or an address written HOST[:PORT]."""
         if endpoint := self._table.endpoints.get(name):
-            if endpoint.address.value.is_learned:
-                source_port = endpoint.source_port.value if endpoint.source_port else _PORT
-                return stand_in(self._table, endpoint, _LEARNED_HOST), source_port
-            return sent_by(endpoint)
-        host, colon, port = name.partition(":")
+            return sender_in_tests(self._table, endpoint)
+        text = re.sub(r"^localhost(?=:|$)", LOOPBACK, name)
         try:
-            return parse_address(f"{'127.0.0.1' if host == 'localhost' else host}:{port if colon else _PORT}")
+            return parse_address(f"{bracketed(text)}:{PORT_IN_TESTS}" if is_host(text) else text)
         except BadAddressError as error:
             message = f"'{name}' is neither HOST[:PORT] nor a name of the route table"
             raise InvalidValueError(
@@ -184,21 +177,31 @@ class Names:
             ) from error
 
     def listener(
-        self, named: Located[str] | None, sender: str, payloads: Sequence[tuple[PayloadCase, Fields]], span: SourceSpan
+        self,
+        named: Located[str] | None,
+        sender: str,
+        host: str,
+        payloads: Sequence[tuple[PayloadCase, Fields]],
+        span: SourceSpan,
     ) -> str:
         """Return the listener that is named, else the one at which the sender is accepted, else the only one.
 
-        The only one is among those that receive the envelope of the payloads.
+        The only one is among those that receive the envelope of the payloads, and from addresses like the sender's.
         """
         listeners = self._table.listeners
         if named is not None:
-            return self._known(named.value, listeners, named.span, "listener")
+            name = self._known(named.value, listeners, named.span, "listener")
+            if not takes_from(listeners[name], host):
+                message = f"nothing arrives from {host} at '{name}': only one of them is IPv6"
+                raise InvalidValueError(named.span, Code.BAD_VALUE, message)
+            return name
         endpoint = self._table.endpoints.get(sender)
         if endpoint is not None and endpoint.listener is not None:
             return endpoint.listener.value
         envelopes = self._program.envelopes
         around = [envelopes.of(case.name) for case, _ in payloads]
-        fitting = [name for name in listeners if not around or envelopes.at(name) is around[0]]
+        near = [name for name, each in listeners.items() if takes_from(each, host)]
+        fitting = [name for name in near if not around or envelopes.at(name) is around[0]]
         if len(fitting) != 1:
             raise InvalidValueError(span, Code.MISSING_KEY, f"name the listener: {', '.join(fitting or listeners)}")
         return fitting[0]
@@ -316,12 +319,13 @@ class GivenReader:
             if (entry := node.entries.get(key)) and forms[0] not in needed:
                 raise InvalidValueError(entry.key.span, Code.UNKNOWN_KEY, f"'{key}' needs 'case'")
         payloads = [*self._payloads(span, node)]
+        peer = self._names.peer(sender.value, sender.span)
         pad = integer(node, "pad")
         times, every, age = _repetition(node)
         return Given(
             span=span,
-            peer=self._names.peer(sender.value, sender.span),
-            listener=self._names.listener(optional_text(node, "listener"), sender.value, payloads, span),
+            peer=peer,
+            listener=self._names.listener(optional_text(node, "listener"), sender.value, peer[0], payloads, span),
             payloads=payloads,
             beside=self._content(self._names.beside(payloads[0][0]), node.get("envelope"), span) if payloads else None,
             data=data,

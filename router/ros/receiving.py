@@ -53,6 +53,7 @@ def sent_at(sent: int, received: int) -> int:
     """
     return min(sent or received, received or sent) or wall_ns()
 
+
 TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of the functions with which a native thread takes messages and resets errors."""
 

@@ -71,9 +71,9 @@ class HeadStart:
         for name, address, is_board, cast, listener in image.senders:
             source = placed(self.listening.get(listener) if listener is not None else None, every)
             try:
-                opened = open_sending(source, every, is_board=is_board)
+                opened = open_sending(source, every, is_board=is_board, host=address[0])
             except OSError:  # as in `net.udp.open_sending`, which logs it later
-                source, opened = None, open_sending(None, is_board=is_board)
+                source, opened = None, open_sending(None, is_board=is_board, host=address[0])
             sender = NativeSender(library(), address, opened, source, cast)
             self.senders[name] = (address, is_board, cast), sender
 

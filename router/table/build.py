@@ -11,14 +11,23 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
-from ipaddress import IPv4Network
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
 from router import inputs
 from router.assets import asset
 from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
-from router.table.addresses import LOCAL, REMOTE, Address, LinkPlace, SerialPlace, TcpPlace, no_port
+from router.table.addresses import (
+    LOCAL,
+    REMOTE,
+    Address,
+    IPNetwork,
+    LinkPlace,
+    SerialPlace,
+    TcpPlace,
+    no_port,
+)
 from router.table.keys import Key, keys_of
 from router.table.model import Networks, RouteTable
 from router.table.model.endpoints import Endpoint, Framing, Listener
@@ -377,14 +386,18 @@ def _networks(entry: Entry) -> Networks:
     return Networks(entry.key.span, tuple(map(_network, sequence(entry.value).items)))
 
 
-def _network(node: Node) -> IPv4Network:
+def _network(node: Node) -> IPNetwork:
     written = located(node)
     try:
-        return IPv4Network(written.value)
-    except ValueError as error:  # host bits are set; the schema has checked the form
-        hint = f"write {IPv4Network(written.value, strict=False)}"
+        network = ip_network(written.value, strict=False)
+    except ValueError as error:  # IPv6: the schema has checked the form of IPv4 networks
+        what = f"'{written.value}' is not a network"
+        raise InvalidValueError(written.span, Code.BAD_VALUE, what, "write one such as fd00::/8") from error
+    try:
+        return ip_network(written.value)
+    except ValueError as error:
         what = f"{written.value} is the address of a host, not of a network"
-        raise InvalidValueError(written.span, Code.BAD_VALUE, what, hint) from error
+        raise InvalidValueError(written.span, Code.BAD_VALUE, what, f"write {network}") from error
 
 
 # routes
@@ -668,12 +681,12 @@ def _inbound_deadman(entry: Entry) -> InboundDeadman:
     return structure(InboundDeadman, settings, span=entry.key.span, fields=_constants(settings.entries["send"]))
 
 
-_SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
+_SYNTAX: Mapping[object, Callable[[Node, SourceSpan], object]] = {
     Checksum: lambda node, _: _checksum(node),
     Destination: _destination,
     Expression: _expression,
     FieldMap: _fields,
-    IPv4Network: lambda node, _: _network(node),
+    IPNetwork: lambda node, _: _network(node),
     Obeyed: _obeyed,
     StreamFraming: lambda node, _: _stream_framing(node),
     Topic: _topic,

@@ -87,9 +87,10 @@ class Key:
 
     def text(self, value: Any) -> str:
         """Return the value as it is written in a table."""
-        if self.quantity is not None:
-            return self.quantity.show(value.value if isinstance(value, Located) else value)
-        return _text(value)
+        if self.quantity is None:
+            return _text(value)
+        values = value if self.is_list else (value,)
+        return ", ".join(self.quantity.show(each.value if isinstance(each, Located) else each) for each in values)
 
 
 def _text(value: object) -> str:

@@ -110,6 +110,11 @@ _FOREIGN = re.compile(
 )
 """Typographic spaces, quotes and dashes where a value or key begins; full-width signs after ASCII characters."""
 _ASCII = str.maketrans("\u2013\u2014\u2018\u2019\u201c\u201d", "--''\"\"")
+_IPV6 = re.compile(
+    r"(?<![^\s,\[{])(?:(?:[a-z]+/)?\[[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(?:%[\w.-]+)?\]:\d+|::[0-9A-Fa-f:.]*(?:/\d+)?"
+    r"|[0-9A-Fa-f:]+::(?![^\s,\]}]))"
+)
+"""IPv6 addresses with a bracket, or with a ':' at the beginning or end."""
 _HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t]))#.*""")
 _SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
@@ -132,7 +137,7 @@ def explain(
     column = error.problem_mark.column if error.problem_mark else 0
     if open_quote:
         return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
-    if slip := _slip(source, line) or exclamation(source, line):
+    if slip := _slip(source, line) or exclamation(source, line) or _ipv6(source, line, column):
         return slip
     if error.problem == _UNENDING and error.context_mark:
         return _finding(source, error.context_mark.line, error.context_mark.column, _OPEN_QUOTE)
@@ -201,6 +206,15 @@ def _slip(source: Source, line: int) -> Diagnostic | None:
             quote = '"' if plain == "'" else "'"
             hint = f"replace it with {quote}{plain}{quote}" if plain.isascii() else "remove it"
             return _finding(source, number, match.start(match.lastgroup or 0), _Advice(what, hint))
+    return None
+
+
+def _ipv6(source: Source, line: int, column: int) -> Diagnostic | None:
+    """Return a finding for an IPv6 address without quotes at or before a column, or None."""
+    for match in _IPV6.finditer(_text(source, line)):
+        if match.start() <= column <= match.end():
+            span = source.span(line, match.start(), line, match.end())
+            return Diagnostic(span, Code.BAD_YAML, "an IPv6 address needs quotes here", f'write "{match[0]}"')
     return None
 
 

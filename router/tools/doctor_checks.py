@@ -11,7 +11,7 @@ import shutil
 import socket
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from time import monotonic
@@ -21,9 +21,12 @@ from router.assets import asset
 from router.compiler.compiled_table import CalledPlan, ClientCallPlan, CompiledTable, ServicePlan
 from router.compiler.extras import missing_extras, missing_modules
 from router.errors import Located, StartError, listed, plural, shown_path
+from router.hosts import any_of, bracketed, is_ipv6
 from router.library import load
+from router.net.addresses import family, host_and_port, open_socket, socket_address
 from router.net.dds import clashes, discovers_by_multicast
 from router.net.kernel import BELOW_ROS, interface_is_up, port_holder
+from router.net.ready import readable
 from router.net.udp import absence, why_no_way
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy, unresolved_peers
 from router.table.addresses import LOCATOR, Address, BadAddressError, LinkPlace, parse_address
@@ -211,6 +214,7 @@ PATIENCE = 1.0
 """Seconds for an answer to a ping; a board answers within milliseconds."""
 
 _ECHO, _ECHO_REPLY = 8, 0
+_ECHO_IPV6, _ECHO_REPLY_IPV6 = 128, 129
 _ICMP = struct.Struct("!BBHHH")
 
 _KEEPS = "systemd"
@@ -274,7 +278,7 @@ def _pages(program: CompiledTable) -> tuple[tuple[Located[Address] | None, str],
 
 
 def _gateways(program: CompiledTable) -> Iterator[tuple[str, Address, str]]:
-    """Yield what gateways bind: (protocol, address, owner). Of Zenoh's locators, only TCP ones with an IPv4 address."""
+    """Yield what gateways bind: (protocol, address, owner). Of Zenoh's locators, only TCP ones with an IP address."""
     for gateway in program.table.gateways.values():
         what = f"gateway '{gateway.name}'"
         if gateway.receive is not None:
@@ -295,19 +299,21 @@ def _port(
     `is_shared`: with SO_REUSEADDR, as by servers and listeners with groups. `waits`: the router waits for an address
     that no interface has yet.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
+    kind = socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM
+    with open_socket(address.host, kind) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, is_shared)
         try:
             if interface is not None:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
-            probe.bind(address)
+            probe.bind(socket_address(*address))
         except OSError as error:
             yield from _refused(protocol, address, what, error, waits)
 
 
 def _refused(protocol: str, address: Address, what: str, error: OSError, waits: bool) -> Iterator[CheckResult]:
-    if error.errno == errno.EADDRNOTAVAIL:
-        remedy = "give an interface that address (`ip address`), or write 0.0.0.0 in the table"
+    if error.errno in (errno.EADDRNOTAVAIL, errno.ENODEV):
+        wildcard = bracketed(any_of(address.host))
+        remedy = f"give an interface that address (`ip address`), or write {wildcard} in the table"
         grade = warning if waits else problem
         yield grade("ports", f"{what}: no interface of this computer has {address.host}", remedy)
         return
@@ -386,37 +392,42 @@ def _has_way(endpoint: Endpoint) -> bool:
 def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
     """Return the `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
     answered: set[str] = set()
-    with _open_ping() as pinging:
-        request = _request(os.getpid() & 0xFFFF)
+    with ExitStack() as opened:
+        pinging = {each: opened.enter_context(_open_ping(each)) for each in sorted({*map(family, hosts)})}
         for host in hosts:
             with suppress(OSError):  # unreachable
-                pinging.sendto(request, (host, 0))
+                pinging[family(host)].sendto(_request(host), socket_address(host, 0))
         deadline = monotonic() + patience
         while answered != hosts and (left := deadline - monotonic()) > 0:
-            pinging.settimeout(left)
-            try:
-                reply, (host, _) = pinging.recvfrom(1500)
-            except OSError:  # or a timeout
-                continue
-            if pinging.type == socket.SOCK_RAW:
-                reply = reply[(reply[0] & 0xF) * 4 :]  # what follows the IP header
-            if reply[:1] == bytes([_ECHO_REPLY]):
-                answered.add(host)
+            for each in readable(pinging.values(), left):
+                with suppress(OSError):  # such as an ICMP error
+                    answered |= _answerer(each)
     return answered & hosts
 
 
-def _open_ping() -> socket.socket:
+def _open_ping(of: socket.AddressFamily) -> socket.socket:
     """Open an unprivileged ICMP socket if the system allows it, else a raw one."""
+    protocol = socket.IPPROTO_ICMPV6 if of == socket.AF_INET6 else socket.IPPROTO_ICMP
     try:
-        return socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_ICMP)
+        return socket.socket(of, socket.SOCK_DGRAM, protocol)
     except PermissionError:
-        return socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP)
+        return socket.socket(of, socket.SOCK_RAW, protocol)
 
 
-def _request(identity: int) -> bytes:
-    """Return an echo request with its checksum, which raw sockets need."""
-    total = (_ECHO << 8) + identity + 1
-    return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
+def _request(host: str) -> bytes:
+    """Return an echo request. It has the checksum that raw IPv4 sockets need; the kernel adds that of IPv6."""
+    kind, identity = _ECHO_IPV6 if is_ipv6(host) else _ECHO, os.getpid() & 0xFFFF
+    total = (kind << 8) + identity + 1
+    return _ICMP.pack(kind, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
+
+
+def _answerer(pinging: socket.socket) -> set[str]:
+    """Return the host that has answered a ping; none if something else has arrived. Raises OSError."""
+    reply, address = pinging.recvfrom(1500)
+    host, _ = host_and_port(address)
+    if pinging.type == socket.SOCK_RAW and not is_ipv6(host):
+        reply = reply[(reply[0] & 0xF) * 4 :]  # what follows the IP header
+    return {host} if reply[:1] == bytes([_ECHO_REPLY_IPV6 if is_ipv6(host) else _ECHO_REPLY]) else set()
 
 
 def extras(program: CompiledTable) -> Iterator[CheckResult]:

@@ -17,15 +17,16 @@ from router.compiler.compiled_table import CompiledTable, GatewayPlan, InboundPl
 from router.compiler.expressions.tree import ENVELOPE
 from router.compiler.mapping import Row
 from router.compiler.metrics import PUBLISHER, SUBSCRIBER
-from router.compiler.network import sent_by
+from router.compiler.network import takes_from
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.resolution import with_stand_ins
+from router.compiler.resolution import sender_in_tests, with_stand_ins
 from router.compiler.selection import TopicSelector
 from router.compiler.states import sets_state, states_read
 from router.compiler.topics import qos_of, resolved
-from router.datagrams import Wire
+from router.datagrams import Peer, Wire
 from router.errors import ConfigurationError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
+from router.hosts import LOOPBACK, LOOPBACK_IPV6, bracketed
 from router.rehearsal.describing import EventDescriber
 from router.rehearsal.fields import shown
 from router.rehearsal.rehearsal import Received, Rehearsal
@@ -45,7 +46,6 @@ from router.table.model.routes import ANY, ROS, Route
 from router.table.model.state import State
 from router.table.model.targets import OnLimit, Topic
 from router.table.units import duration
-from router.tools.udp import LOOPBACK
 from router.types.board_limits import BoardField, BoardLimits, BoardMessage
 from router.types.protobuf import PayloadCase
 from router.values.reading import payload
@@ -109,11 +109,8 @@ def tried_route(
         raise UsageError(f"{route.name} has no 'source'", "--given is for routes that take datagrams")
     message, source = payload(case, words), route.sources[0].value
     program = with_stand_ins(program)
-    table = program.table
-    endpoint = table.endpoints.get(source)
-    listener = endpoint.listener.value if endpoint and endpoint.listener else wire.envelopes.listener_for(case.name)
     rehearsal = Rehearsal(program)
-    rehearsal.datagram(listener, sent_by(endpoint) if endpoint else (LOOPBACK, 0), wire.encode(case, message))
+    rehearsal.datagram(*_arrival(program, source, case), wire.encode(case, message))
     yield ""
     yield f"  given {shown(case.type, message)} from {source}:"
     happened = [event for event in rehearsal.events if not isinstance(event, Received)]
@@ -153,6 +150,19 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
         yield f"  no deadman: {route.no_deadman}"
     if no_ttl := phrases(route).get("no_ttl"):
         yield f"  {no_ttl}"
+
+
+def _arrival(program: CompiledTable, source: str, case: PayloadCase) -> tuple[str, Peer]:
+    """Return the listener that receives a payload case from a source, by default the first one, and its address."""
+    table, envelopes = program.table, program.envelopes
+    holding = [each for each in table.listeners.values() if envelopes.at(each.name) is envelopes.of(case.name)]
+    first, *_ = listeners = holding or [*table.listeners.values()]
+    if (endpoint := table.endpoints.get(source)) is None:
+        return first.name, (LOOPBACK if takes_from(first, LOOPBACK) else LOOPBACK_IPV6, 0)
+    peer = sender_in_tests(table, endpoint)
+    if endpoint.listener is not None:
+        return endpoint.listener.value, peer
+    return next((each.name for each in listeners if takes_from(each, peer[0])), first.name), peer
 
 
 def _set(state: State, route: Route) -> str:
@@ -218,12 +228,14 @@ def _source(name: str, table: RouteTable) -> str:
     if name == ANY:
         return name
     endpoint = table.endpoints[name]
-    port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
+    address, port = endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else None
     if endpoint.address.value.is_learned:
-        port = f" from port {endpoint.source_port.value}" if endpoint.source_port else ""
-        port += f" in {', '.join(map(str, endpoint.networks))}" if endpoint.networks else ""
+        address += f" from port {port}" if port else ""
+        address += f" in {', '.join(map(str, endpoint.networks))}" if endpoint.networks else ""
+    elif port is not None:
+        address = f"{bracketed(address)}:{port}"
     by = f" by listener {endpoint.listener.value}" if endpoint.listener else ""
-    return f"{name} ({endpoint.address.value.host}{port}{by})"
+    return f"{name} ({address}{by})"
 
 
 def _destination(served: Target, checked: CheckedRoute, everything: Checked, how: str) -> Iterator[str]:

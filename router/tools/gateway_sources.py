@@ -18,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from router.errors import Located, SourceSpan, UsageError, did_you_mean
 from router.gateway.packets import Packet, PacketError, pack
+from router.net.addresses import socket_address
 from router.net.kernel import ask_for_receive_buffer, drops
 from router.table.addresses import Address
 from router.table.model.gateways import GatewayFormat, ZenohConfig, ZenohSettings
@@ -220,10 +221,11 @@ class WebsocketSource(ConnectedSource):
         super().__init__("websocket", address, say)
 
     def _open(self, opened: socket.socket, connected: ExitStack) -> None:
+        host, _, _ = self._address.host.partition("%")  # a zone is only for this computer
         try:
             self._websocket: ClientConnection = connected.enter_context(
                 connect(
-                    f"ws://{self._address}/",
+                    f"ws://{self._address._replace(host=host)}/",
                     sock=opened,
                     compression=None,
                     max_size=LONGEST,
@@ -261,7 +263,7 @@ class UdpSource:
         self._readable.register(self._socket, select.POLLIN)
         self._gateway = gateway
         self._say = say
-        self.place = f"udp {Address(*self._socket.getsockname())}"
+        self.place = f"udp {udp.address_of(self._socket)}"
 
     @property
     def lost(self) -> int:
@@ -274,7 +276,7 @@ class UdpSource:
             return
         request = Packet(time.time(), is_compressed=False, topic="", type_name="", payload=b"")
         try:
-            self._socket.sendto(pack(request), self._gateway)
+            self._socket.sendto(pack(request), socket_address(*self._gateway))
         except OSError as error:
             self._say(f"cannot ask {self._gateway}: {error.strerror}")
 

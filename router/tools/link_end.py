@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from router.carrier.frames import Codec, Frame
 from router.errors import TransportError
 from router.image.openings import framing_of
 from router.net.links import why_closed
+from router.net.ready import await_room
 from router.tools.tap import PATIENCE
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class LinkEnd:
     def finish(self) -> None:
         """Wait until what was sent has left. Raises OSError."""
         while self._rest:
-            select.select([], [self._fd], [], PATIENCE)
+            await_room(self._fd, PATIENCE)
             self._flush()
 
     def _flush(self) -> None:

@@ -19,6 +19,7 @@ from router.clock import wall_ns
 from router.errors import TransportError, UsageError
 from router.library import library
 from router.net.links import device_holder, why_closed
+from router.net.ready import readable
 from router.table.addresses import LinkPlace
 from router.table.model.tcp import TcpClient, TcpServer
 from router.tools.link_end import OPENED_WITHIN, READ_WITHIN, LinkEnd
@@ -213,7 +214,7 @@ def listen(ends: Sequence[tuple[LinkEnd, str]], wire: Wire, envelope: Envelope) 
             time.sleep(OPENED_WITHIN)
             yield []
             continue
-        ready, _, _ = select.select(opened, [], [], PATIENCE)
+        ready = readable(opened, PATIENCE)
         yield [shown for end in ready for frame in _arrived(end) for shown in _shown(frame, peers[end], wire, envelope)]
 
 

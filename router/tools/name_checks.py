@@ -8,7 +8,7 @@ from time import monotonic
 
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.resolution import names, resolved, unresolved, why_unusable
-from router.net.udp import addresses_of
+from router.net.addresses import addresses_of
 from router.threads import Thread
 from router.tools.doctor_checks import CheckResult, fine, problem
 
@@ -48,7 +48,7 @@ class Names:
                 yield fine("names", f"{endpoint}: {host} is {address}")
                 continue
             what = f"{endpoint}: {host} is not resolved: {self._why(host)}"
-            yield problem("names", what, f"check it with `getent ahostsv4 {host}`, or write the address")
+            yield problem("names", what, f"check it with `getent ahosts {host}`, or write the address")
 
     def _why(self, host: str) -> str:
         match self._found.get(host):

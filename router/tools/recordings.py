@@ -11,6 +11,7 @@ from time import monotonic_ns, time_ns
 
 from router.compiler.network import arrival
 from router.errors import TransportError, UsageError, did_you_mean
+from router.net.addresses import host_and_port
 from router.observe.tap import Lost
 from router.recording.about import about
 from router.recording.channels import Channels
@@ -163,7 +164,7 @@ class Replayer:
         try:
             self.resent.refused += udp.send_once(sender, datagram.data)
         except OSError as error:
-            raise udp.cannot_send(Address(*sender.getpeername()), error) from error
+            raise udp.cannot_send(Address(*host_and_port(sender.getpeername())), error) from error
         self.resent.datagrams += 1
 
     def _moved(self, datagram: Recorded) -> Recorded:
@@ -186,7 +187,8 @@ class Replayer:
         self._sockets.clear()
 
     def _open(self, datagram: Recorded) -> socket.socket:
-        to, sender = self._destination(datagram.listener), self._bound(datagram)
+        to = self._destination(datagram.listener)
+        sender = self._bound(datagram, to)
         try:
             udp.connect(sender, to)
         except TransportError:
@@ -203,19 +205,19 @@ class Replayer:
             raise UsageError(f"the table does not have the listener '{listener}' of the recording", hint or "give --to")
         return udp.listener_address(listeners[listener])
 
-    def _bound(self, datagram: Recorded) -> socket.socket:
+    def _bound(self, datagram: Recorded, to: Address) -> socket.socket:
         if self._origin is not None:
-            return udp.open_udp(self._origin, "--from")
+            return udp.open_udp(udp.origin_of(to, self._origin), "--from")
         wanted = Address(*datagram.peer)
         if self._table is not None and datagram.endpoint in self._table.endpoints:
             wanted = udp.origin(datagram.endpoint, self._table)
         for address in (wanted, wanted._replace(port=0)):
             try:
-                return udp.open_udp(address, datagram.endpoint)
+                return udp.open_udp(udp.origin_of(to, address), datagram.endpoint)
             except UsageError:
                 continue
-        self.resent.elsewhere[datagram.endpoint or f"{datagram.peer[0]}:{datagram.peer[1]}"] = wanted.host
-        return udp.open_udp(udp.ANYWHERE, "replay")
+        self.resent.elsewhere[datagram.endpoint or str(Address(*datagram.peer))] = wanted.host
+        return udp.open_udp(udp.origin_of(to), "replay")
 
 
 def _board_end(link: Listener, board: Endpoint) -> LinkEnd | UsageError:

@@ -6,7 +6,6 @@ import errno
 import http.client
 import json
 import re
-import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
+from router.hosts import bracketed
 from router.observe.problems import Kind, Problem
 from router.observe.services import ServiceReading
 from router.observe.states import StateReading
@@ -174,8 +174,17 @@ class _ControlConnection(http.client.HTTPConnection):
 
     def connect(self) -> None:
         from router.net import control
+        from router.net.addresses import addresses_of
 
-        self.sock = control.connect(socket.gethostbyname(self.host), self.port, self.timeout)
+        errors: list[OSError] = []
+        for host in addresses_of(self.host):
+            try:
+                self.sock = control.connect(host, self.port, self.timeout)
+            except OSError as error:
+                errors.append(error)
+            else:
+                return
+        raise errors[0]
 
 
 def _control(url: str, patience: float) -> http.client.HTTPConnection:
@@ -184,8 +193,10 @@ def _control(url: str, patience: float) -> http.client.HTTPConnection:
 
 
 def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: str) -> http.client.HTTPResponse:
+    host, _, _ = connection.host.partition("%")  # a zone is only for this computer
+    headers = {"Host": f"{bracketed(host)}:{connection.port}"}
     try:
-        connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
+        connection.request(method, path, headers=headers | ({"Content-Length": "0"} if method == "POST" else {}))
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
         if isinstance(error, OSError) and error.errno == errno.EADDRNOTAVAIL:

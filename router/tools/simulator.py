@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import heapq
+import os
 import random
 import re
 import selectors
@@ -22,9 +23,12 @@ from typing import Any
 
 from router.compiler.compiled_table import DeadmanPlan, ServicePlan
 from router.compiler.expressions.tree import ENVELOPE, MESSAGE
+from router.compiler.network import fitting
 from router.compiler.resolution import stand_in
 from router.datagrams import Decoded, Wire
 from router.errors import UsageError, did_you_mean, listed
+from router.hosts import LOOPBACK, LOOPBACK_IPV6, loopback_of
+from router.net.addresses import family, socket_address
 from router.table.addresses import Address, LinkPlace
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint, Listener
@@ -35,7 +39,7 @@ from router.tools.board import Change, Inbox, boards
 from router.tools.link_end import LinkEnd
 from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, Pose, pose
 from router.tools.sim_replies import Reply, replies
-from router.tools.udp import LOOPBACK, listener_address, located, open_udp
+from router.tools.udp import listener_address, open_udp, place_of
 from router.types.model import Int, MessageType
 from router.types.paths import type_at
 from router.types.protobuf import PayloadCase
@@ -259,15 +263,15 @@ class Simulator:
         self._stopping = False
         try:
             self._routers = {listener.name: listener_address(listener) for listener in table.sockets}
-            # Endpoints without a `listener` send to the first one that receives the payload case.
             names, envelopes = (*self._routers, *(link.name for link in table.links)), wire.envelopes
-            self._first = {
-                case: next((name for name in names if envelopes.at(name) is envelopes.of(case)), names[0])
+            self._receivers = {
+                case: [name for name in names if envelopes.at(name) is envelopes.of(case)] or [*names]
                 for case in envelopes.cases
             }
             for endpoint in table.endpoints.values():
                 self._open_endpoint(endpoint)
-            self._senders[STRANGER] = self._sending(self._open(Address(LOOPBACK, 0), STRANGER), None)
+            hosts = sorted({loopback_of(address.host) for address in self._routers.values()})
+            self._senders[STRANGER] = self._sending([self._open(Address(host, 0), STRANGER) for host in hosts], None)
         except BaseException:
             self.close()
             raise
@@ -297,28 +301,35 @@ class Simulator:
             self._unopened[end] = inbox
             self._senders[endpoint.name] = lambda data, _: end.send(data)
             return
-        port = endpoint.source_port.value if endpoint.source_port else 0
-        is_learned = endpoint.address.value.is_learned
-        own = Address(stand_in(self._table, endpoint, LOOPBACK), port) if is_learned else endpoint.address.value
-        address = located(own)
+        if endpoint.address.value.is_learned:
+            loopback = LOOPBACK if False in fitting(self._table, endpoint) else LOOPBACK_IPV6
+            port = endpoint.source_port.value if endpoint.source_port else 0
+            address = Address(stand_in(self._table, endpoint, loopback), port)
+        else:
+            address = place_of(endpoint, self._table)
         receiver = sender = self._open(address, endpoint.name, endpoint)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)
         for opened in {receiver, sender}:  # replies go to the port that the endpoint sends from
             self._selector.register(opened, selectors.EVENT_READ, (opened, inbox))
-        self._senders[endpoint.name] = self._sending(sender, listener)
+        self._senders[endpoint.name] = self._sending([sender], listener)
 
-    def _sending(self, sender: socket.socket, listener: str | None) -> Callable[[bytes, str], None]:
-        """Return a function that sends the envelope of a payload case from a socket to a listener.
+    def _sending(self, senders: Collection[socket.socket], listener: str | None) -> Callable[[bytes, str], None]:
+        """Return a function that sends the envelope of a payload case to a listener, from the socket of its family.
 
         The default is the first one that receives the case; a link only if no other does.
         """
+        by_family = {sender.family: sender for sender in senders}
 
         def send(data: bytes, case: str) -> None:
-            if (to := listener or self._first[case]) in self._ends:
-                self._ends[to].send(data)
-            else:
-                sender.sendto(data, self._routers[to])
+            for name in [listener] if listener is not None else self._receivers[case]:
+                if (end := self._ends.get(name)) is not None:
+                    return end.send(data)
+                to = self._routers[name]
+                if (sender := by_family.get(family(to.host))) is not None:
+                    sender.sendto(data, socket_address(*to))
+                    return None
+            raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
 
         return send
 

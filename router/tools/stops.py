@@ -177,7 +177,7 @@ class Stop:
         if not sources:
             return f"no command of {self.route} was sent", ""
         hosts = [heard[source][1] for source in sources if source in heard and self._is_silent(source)]
-        remedy = Kind.ENDPOINT_SILENT.remedy.format(address=hosts[0]) if len(hosts) == len(sources) else ""
+        remedy = Kind.ENDPOINT_SILENT.remedy_at(hosts[0]) if len(hosts) == len(sources) else ""
         return "; ".join(map(self._silence, sources)), remedy
 
     def _is_silent(self, source: str) -> bool:

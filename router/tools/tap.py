@@ -18,11 +18,13 @@ from router.compiler.expressions.kinds import BoolKind
 from router.compiler.expressions.tree import ENVELOPE, Node
 from router.compiler.lowering import lower_condition
 from router.compiler.lowering.names import TooLargeError
-from router.datagrams import Decoded, Wire
+from router.datagrams import Decoded, Peer, Wire
 from router.errors import Code, DecodeError, Diagnostic, SourceSpan, UsageError
 from router.library import library
+from router.net.addresses import host_and_port
 from router.observe.tap import Lost
 from router.recording.mirror import BRAKED, FED, LOST, RELEASED, RETURNED, SENT, TRIPPED, Action, MirroredDatagram
+from router.table.addresses import Address
 from router.table.model.expressions import Expression
 from router.table.nodes import TextSpan
 from router.table.units import LARGEST_DATAGRAM
@@ -308,7 +310,7 @@ def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
 
 
 def listen(
-    receiver: socket.socket, wire: Wire, envelope: Envelope, name_of: Callable[[tuple[str, int]], str]
+    receiver: socket.socket, wire: Wire, envelope: Envelope, name_of: Callable[[Peer], str]
 ) -> Iterator[list[TappedDatagram]]:
     """Yield datagrams one by one without end; after PATIENCE without one, an empty list."""
     receiver.settimeout(PATIENCE)
@@ -318,7 +320,7 @@ def listen(
         except TimeoutError:
             yield []
         else:
-            yield tapped_datagram(wall_ns(), name_of(peer), data, wire, envelope=envelope)
+            yield tapped_datagram(wall_ns(), name_of(host_and_port(peer)), data, wire, envelope=envelope)
 
 
 def tapped_datagram(
@@ -338,7 +340,7 @@ def tapped_datagram(
 def shown(it: MirroredDatagram | Recorded | Action, wire: Wire) -> Sequence[TappedDatagram | ShownAction]:
     """Return each message of a datagram, or an action, as it is printed."""
     if not isinstance(it, Action):
-        peer, envelope = it.endpoint or f"{it.peer[0]}:{it.peer[1]}", wire.envelopes.at(it.listener)
+        peer, envelope = it.endpoint or str(Address(*it.peer)), wire.envelopes.at(it.listener)
         return tapped_datagram(it.at, peer, it.data, wire, it.reason, envelope)
     try:
         decoded = wire.decode(it.data, wire.envelopes.to(it.target)) if it.what in (SENT, BRAKED) else None

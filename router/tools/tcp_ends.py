@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 import socket
 import time
 from collections.abc import Collection
@@ -12,7 +11,9 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from router.errors import UsageError
+from router.net.addresses import host_and_port, open_socket, socket_address
 from router.net.links import why_closed
+from router.net.ready import readable
 from router.tools.link_end import OPENED_WITHIN, READ_AT_ONCE, READ_WITHIN, LinkEnd
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ class Server:
         """Return the newest connection from one of `hosts` if it is another one than before."""
         with suppress(BlockingIOError):
             while True:
-                opened, (peer, _) = self._socket.accept()
+                opened, address = self._socket.accept()
+                peer, _ = host_and_port(address)
                 key = ANYBODY if ANYBODY in self._hosts else peer
                 if key not in self._hosts:
                     opened.close()
@@ -116,7 +118,7 @@ class TcpEnd(LinkEnd):
             with socket.socket(fileno=self._fd) as opened, suppress(OSError):
                 opened.shutdown(socket.SHUT_WR)
                 until = time.monotonic() + READ_WITHIN
-                while select.select([opened], [], [], max(0.0, until - time.monotonic()))[0]:
+                while readable([opened], until - time.monotonic()):
                     if not opened.recv(READ_AT_ONCE):
                         break
             self._fd = -1
@@ -181,7 +183,7 @@ class Connecting(TcpEnd):
     def _socket(self) -> socket.socket:
         if self._own is not None:
             return _bound(self.name, self._own)
-        opened = socket.socket()
+        opened = open_socket(self._to.host, socket.SOCK_STREAM)
         opened.setblocking(False)
         return opened
 
@@ -193,7 +195,7 @@ class Connecting(TcpEnd):
                 return None
             self._again = time.monotonic() + AGAIN_AFTER
             self._trying = self._socket()
-        error = self._trying.connect_ex(self._to)
+        error = self._trying.connect_ex(socket_address(*self._to))
         if error in (errno.EINPROGRESS, errno.EALREADY):
             return None
         opened, self._trying = self._trying, None
@@ -210,11 +212,11 @@ class Connecting(TcpEnd):
 
 
 def _bound(name: str, address: Address) -> socket.socket:
-    opened = socket.socket()
+    opened = open_socket(address.host, socket.SOCK_STREAM)
     try:
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        opened.bind(address)
+        opened.bind(socket_address(*address))
     except OSError as error:
         opened.close()
         raise _not_bound(name, address, error) from error

@@ -7,12 +7,14 @@ import errno
 import itertools
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.errors import TransportError, UsageError, did_you_mean
-from router.table.addresses import Address, LinkPlace
+from router.hosts import ANY_HOST, any_of, bracketed, is_any, is_ipv6, loopback_of
+from router.net.addresses import addresses_of, bound_address, family, open_socket, socket_address
+from router.table.addresses import Address, BadAddressError, LinkPlace, is_host, parse_ipv6
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable
@@ -20,10 +22,8 @@ if TYPE_CHECKING:
     from router.types.protobuf import Envelope
     from router.types.table_envelopes import Envelopes
 
-ANY_HOST = "0.0.0.0"
-LOOPBACK = "127.0.0.1"
 ANYWHERE = Address(ANY_HOST, 0)
-"""Any local address and port, chosen by the kernel."""
+"""Any local address and port, chosen by the kernel. `origin_of` makes it one of the destination's family."""
 
 
 def destination(text: str, table: RouteTable | None) -> Address:
@@ -32,31 +32,29 @@ def destination(text: str, table: RouteTable | None) -> Address:
         return listener_address(table.listeners[text])
     if (named := _named(text, table)) is not None:
         return reachable(named)
-    host, colon, port = text.rpartition(":")
-    if not colon or not host:
+    host, port = _split(text)
+    if not host or port is None:
         raise _not_a_place(text, table, "HOST:PORT")
-    _refuse_port_of_name(host, text, table)
+    _refuse_port_of_name(host, port, table)
     return Address(_resolve(host), _port(port, lowest=1))
 
 
 def listening(text: str, table: RouteTable | None) -> Address:
-    """Parse `[HOST:]PORT` (without a host, all local addresses), or a name of the table. Raises UsageError."""
+    """Parse `[HOST:]PORT`, or a name of the table. Without a host, all local IPv4 addresses. Raises UsageError."""
     if (named := _named(text, table)) is not None:
         return named
-    host, _, port = text.rpartition(":")
-    if not port.isdigit():
+    host, port = ("", text) if text.isdigit() else _split(text)
+    if port is None or not port.isdigit():
         raise _not_a_place(text, table, "[HOST:]PORT")
-    _refuse_port_of_name(host, text, table)
+    _refuse_port_of_name(host, port, table)
     return Address(_resolve(host) if host else ANY_HOST, _port(port, lowest=0))
 
 
 def received_at(address: Address, table: RouteTable, envelopes: Envelopes) -> Envelope:
     """Return the envelope that an endpoint or listener with this address receives, by default the first one."""
-    hosts = (address.host, ANY_HOST)
+    hosts = (address.host, any_of(address.host))
     for endpoint in table.endpoints.values():
-        if endpoint.address.value == address or (
-            address.host == ANY_HOST and endpoint.address.value.port == address.port
-        ):
+        if endpoint.address.value == address or (is_any(address.host) and endpoint.address.value.port == address.port):
             return envelopes.to(endpoint.name)
     for listener in table.listeners.values():
         if listener.address.value.port == address.port and listener.address.value.host in hosts:
@@ -68,31 +66,42 @@ def origin(text: str, table: RouteTable | None) -> Address:
     """Parse `HOST[:PORT]`, or an endpoint's name: its host, and its `source_port` if it has one. Raises UsageError."""
     if table is not None and text in table.endpoints:
         endpoint = table.endpoints[text]
-        address = _of_udp(endpoint.address.value, text)
-        own = ANYWHERE if address.is_learned else located(address)
+        own = ANYWHERE if endpoint.address.value.is_learned else place_of(endpoint, table)
         return own._replace(port=endpoint.source_port.value if endpoint.source_port else 0)
-    host, colon, port = text.partition(":")
-    if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
+    host, port = _split(text)
+    if port is not None:
+        _refuse_port_of_name(host, port, table)
+        return Address(_resolve(host), _port(port, lowest=0))
+    if table is not None and not is_ipv6(host) and not host[:1].isdigit() and host != "localhost":
         raise _not_a_place(text, table, "HOST[:PORT]")
-    if colon:
-        _refuse_port_of_name(host, text, table)
-    return Address(_resolve(host), _port(port, lowest=0) if colon else 0)
+    return Address(_resolve(host), 0)
+
+
+def origin_of(to: Address, origin: Address = ANYWHERE) -> Address:
+    """Return the address to bind for sending to `to` from `origin`. Raises UsageError if only one of them is IPv6."""
+    if is_any(origin.host):
+        return origin._replace(host=any_of(to.host))
+    if origin.is_ipv6 != to.is_ipv6:
+        what = f"nothing can be sent to {to} from {origin.host}: only one of them is an IPv6 address"
+        raise UsageError(what, f"give --from an {'IPv6' if to.is_ipv6 else 'IPv4'} address")
+    return origin
 
 
 def reachable(address: Address, interface: str | None = None) -> Address:
     """Return the address that reaches a socket bound to `address` and `interface`, from this computer.
 
-    Raises UsageError if the interface has no IPv4 address.
+    Raises UsageError if the interface has no address of the same family.
     """
-    if address.host != ANY_HOST:
+    if not is_any(address.host):
         return address
     if interface is None:
-        return address._replace(host=LOOPBACK)
+        return address._replace(host=loopback_of(address.host))
 
     from router.net.kernel import interface_address
 
-    if (host := interface_address(interface)) is None:
-        raise UsageError(f"network interface '{interface}' is not there, or has no IPv4 address to send to")
+    if (host := interface_address(interface, family(address.host))) is None:
+        kind = "IPv6" if address.is_ipv6 else "IPv4"
+        raise UsageError(f"network interface '{interface}' is not there, or has no {kind} address to send to")
     return address._replace(host=host)
 
 
@@ -105,10 +114,10 @@ def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
     """Return a function from a peer's address to its endpoint's name, else to the address as text."""
     from router.compiler.network import recognisers
 
-    by_host, by_address = recognisers(table.endpoints if table is not None else {}, None)
+    by_host, by_address = recognisers(table, None) if table is not None else ({}, {})
 
     def name_of(peer: tuple[str, int]) -> str:
-        return by_address.get(peer) or by_host.get(peer[0]) or f"{peer[0]}:{peer[1]}"
+        return by_address.get(peer) or by_host.get(peer[0]) or str(Address(*peer))
 
     return name_of
 
@@ -125,14 +134,14 @@ def open_udp(address: Address, purpose: str, endpoint: Endpoint | None = None) -
     """
     from router.net.kernel import allow_fragments, why_not_bound
 
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened = open_socket(address.host, socket.SOCK_DGRAM)
     try:
         opened.setblocking(False)
         allow_fragments(opened)
         if endpoint is not None and endpoint.group is not None:
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             _join(opened, address.host, endpoint.interface)
-        opened.bind(address)
+        opened.bind(socket_address(*address))
     except OSError as error:
         opened.close()
         _, why, remedy = why_not_bound("udp", address.port, error)
@@ -159,19 +168,45 @@ def aim(sender: socket.socket, to: Endpoint) -> None:
         raise UsageError(f"cannot send to '{to.name}': there is no network interface '{to.interface}'")
 
 
+def address_of(opened: socket.socket) -> Address:
+    """Return the address that a socket of `open_udp` has."""
+    return Address(*bound_address(opened))
+
+
+def _split(text: str) -> tuple[str, str | None]:
+    """Split `HOST[:PORT]` (with a port, an IPv6 host is in brackets). The port is None if there is none."""
+    if text.startswith("["):
+        host, closing, port = text[1:].partition("]")
+        is_host_of_port = closing and is_ipv6(host) and port[:1] in ("", ":")
+        return (host, port[1:] if port else None) if is_host_of_port else (text, None)
+    host, colon, port = text.rpartition(":")
+    return (host, port) if colon and not is_host(text) else (text, None)
+
+
 def _named(text: str, table: RouteTable | None) -> Address | None:
     if table is None:
         return None
-    named = table.endpoints.get(text) or table.listeners.get(text)
-    return None if named is None else located(_of_udp(named.address.value, text))
+    if (endpoint := table.endpoints.get(text)) is not None:
+        return place_of(endpoint, table)
+    listener = table.listeners.get(text)
+    return None if listener is None else _of_udp(listener.address.value, text)
 
 
-def located(address: Address) -> Address:
-    """Return an address with an IPv4 address in place of its host name. Raises UsageError for one that is learned."""
+def place_of(endpoint: Endpoint, table: RouteTable) -> Address:
+    """Return the UDP address of an endpoint, with an IP address in place of a host name.
+
+    Raises UsageError for the other end of a link, and for an address that is learned.
+    """
+    address = _of_udp(endpoint.address.value, endpoint.name)
     if address.is_learned:
         what = "the table has no address of this endpoint: a running router learns it"
         raise UsageError(what, "write HOST:PORT; `router status` shows the one that was learned")
-    return address._replace(host=_resolve(address.host)) if address.is_name else address
+    if not address.is_name:
+        return address
+
+    from router.compiler.network import fitting
+
+    return address._replace(host=_resolve(address.host, fitting(table, endpoint)))
 
 
 def _of_udp(address: Address, name: str) -> Address:
@@ -181,27 +216,36 @@ def _of_udp(address: Address, name: str) -> Address:
     return address
 
 
-def _refuse_port_of_name(host: str, text: str, table: RouteTable | None) -> None:
+def _refuse_port_of_name(host: str, port: str, table: RouteTable | None) -> None:
     """Raise UsageError for a name of the table with a port, such as `sensor_board:5001`."""
     if (named := _named(host, table)) is not None:
-        _, _, port = text.rpartition(":")
-        hint = f"write {host} alone, or its host with another port: {named.host}:{port}"
+        hint = f"write {host} alone, or its host with another port: {bracketed(named.host)}:{port}"
         raise UsageError(f"'{host}' is a name of the route table, which takes no port", hint)
 
 
 def _not_a_place(text: str, table: RouteTable | None, form: str) -> UsageError:
+    if is_ipv6(text) and is_host(text):
+        return UsageError(f"'{text}' is not {form}", "write an IPv6 address in brackets: [fd00::30]:5000")
     if table is None:
         return UsageError(f"'{text}' is not {form}")
     hint = did_you_mean(text, (*table.endpoints, *table.listeners))
     return UsageError(f"'{text}' is neither {form} nor a name of the route table", hint)
 
 
-def _resolve(host: str) -> str:
+def _resolve(host: str, kinds: Collection[bool] = (False, True)) -> str:
+    """Return the first IP address of a host. `kinds`: what `is_ipv6` may be. Raises UsageError."""
+    if is_ipv6(host):
+        try:
+            return parse_ipv6(host)
+        except BadAddressError as error:
+            raise UsageError(error.what, error.hint) from error
     try:
-        addresses = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+        found = [each for each in addresses_of(host) if is_ipv6(each) in kinds]
     except OSError as error:
-        raise UsageError(f"no IPv4 address for '{host}': {error.strerror}") from error
-    return str(addresses[0][4][0])
+        raise UsageError(f"no IP address for '{host}': {error.strerror}") from error
+    if not found:
+        raise UsageError(f"no {'IPv6' if True in kinds else 'IPv4'} address for '{host}', as its listener needs")
+    return found[0]
 
 
 def _port(text: str, lowest: int) -> int:
@@ -259,7 +303,7 @@ def connect(sender: socket.socket, to: Address) -> None:
     """Connect a socket of `open_udp`, which blocks from then on. Raises TransportError."""
     try:
         sender.setblocking(True)
-        sender.connect(to)
+        sender.connect(socket_address(*to))
     except OSError as error:
         raise cannot_send(to, error) from error
 

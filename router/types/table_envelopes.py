@@ -120,11 +120,6 @@ class Envelopes:
         around = self.to(endpoint)
         return [case] if around is self.of(case.name) else around.holding(case)
 
-    def listener_for(self, case: str) -> str:
-        """Return the first listener that receives this payload case."""
-        holder = self.of(case)
-        return next((name for name in self.listeners if self.at(name) is holder), next(iter(self.listeners)))
-
     def unknown_case(self, name: str) -> tuple[str, str]:
         """Return message and hint for the name of a payload case that does not exist."""
         if several := [each for label in self.by_name if (each := f"{label}.{name}") in self.numbers]:

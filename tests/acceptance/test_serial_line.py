@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from tests.boards.board import skip_without_nanopb
 from tests.docs_commands import blocks, written
 from tests.oracles.framings import BAD, BAD_CHECKSUM, Framing, decoded, encoded
 from tests.ports import free_port
+from tests.readable import readable
 
 PAGE = ROOT / "docs/guides/serial-line.md"
 FRAMING = Framing("cobs", "crc16_ccitt_false")
@@ -98,7 +98,7 @@ class Cable:
 
     def _pass_on(self, source: int, to: int, wire: Wire) -> None:
         """What nobody takes is lost."""
-        if source < 0 or not select.select([source], [], [], 0)[0]:
+        if source < 0 or not readable(source):
             return
         try:
             data = wire.passed(os.read(source, 4096))

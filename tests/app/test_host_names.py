@@ -13,6 +13,8 @@ from structlog.testing import capture_logs
 from router.app import Router, host_names
 from router.app.host_names import HostNames
 from router.clock import boottime_ns
+from router.compiler import check_table
+from router.net.addresses import family
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, numbered, site, udp
 
@@ -97,9 +99,7 @@ def test_until_its_name_is_resolved_nothing_is_sent_to_an_endpoint_or_accepted_f
         assert site.basestation.recv(100) == numbered(2)
     assert robot.recv(100) == BRAKE  # the last one, at the stop
     errors = [entry["error"] for entry in logged if entry.get("target") == "robot"]
-    assert (
-        errors == ["the host name robot-3.local is not resolved: `getent ahostsv4 robot-3.local`"] * len(errors) != []
-    )
+    assert errors == ["the host name robot-3.local is not resolved: `getent ahosts robot-3.local`"] * len(errors) != []
     unresolved = [entry for entry in logged if entry["event"].startswith("host name not resolved")]
     assert [entry["why"] for entry in unresolved] == ([] if hangs else ["Name or service not known"])
 
@@ -135,6 +135,25 @@ def test_another_address_is_followed_once_the_endpoint_is_silent(
         resolver.found = []
         assert router.reload().text == "nothing changed"
         assert router.program.table.endpoints["robot"].address.value.host == "127.0.0.42"
+
+
+@pytest.mark.parametrize(("keys", "host"), [(", listener: six", "::1"), ("", ROBOT)])
+def test_the_address_is_of_the_listeners_family_and_ipv4_if_both_fit(
+    site: Site, resolver: Resolver, keys: str, host: str
+) -> None:
+    resolver.found = [ROBOT, "fe80::1", "::1"]
+    listen = f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n  six: {{address: "[::1]:{site.listen}"}}'
+    with socket.socket(family(host), socket.SOCK_DGRAM) as robot:
+        robot.bind((host, 0))
+        robot.settimeout(10)
+        endpoints = ENDPOINTS.format(port=robot.getsockname()[1]).replace("kind: board", f"kind: board{keys}")
+        checked = check_table(site.write(ROUTES, listen=listen, endpoints=endpoints))
+        assert checked.program is not None
+        with Router(checked.program) as router:
+            assert robot.recv(100) == BRAKE
+            assert router.program.table.endpoints["robot"].address.value.host == host
+            robot.sendto(numbered(1), (host if keys else "127.0.0.1", site.listen))
+            assert site.basestation.recv(100) == numbered(1)
 
 
 @pytest.mark.parametrize("found", ["224.0.0.1", "0.0.0.0", "127.0.0.1"])

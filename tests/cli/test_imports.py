@@ -26,7 +26,7 @@ finally:
         json.dump(sorted(set(sys.modules) - before), out)
 """
 
-GROUND = {"assets", "cli", "clock", "errors", "inputs", "log", "shortage", "types"}
+GROUND = {"assets", "cli", "clock", "errors", "hosts", "inputs", "log", "shortage", "types"}
 """Packages of this project that cost nothing, or that arguments are about."""
 COMPILING = {"google", "grpc_tools", "yaml"}
 """What a table without errors takes."""
@@ -82,7 +82,7 @@ def test_help_and_mistakes_need_no_library(arguments: str, tmp_path: Path) -> No
 def test_status_reads_an_address_and_asks_there(tmp_path: Path) -> None:
     found = imported(tmp_path, "status")
     assert found.heavy == {"yaml"}
-    assert found.packages == {"observe", "table", "tools"}
+    assert found.packages == {"net", "observe", "table", "tools"}
 
 
 @pytest.mark.parametrize(("verb", "control"), [("status", set()), ("reload", {"net"})])

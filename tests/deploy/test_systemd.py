@@ -326,6 +326,30 @@ listen:
     assert running.state() == running.state("rover-router.socket") == "active"
 
 
+def test_ipv6_listeners_have_sockets_of_systemd_but_not_at_link_local_addresses(running: Machine) -> None:
+    """systemd would ignore an interface that is not there when it reads the unit."""
+    table = f"""version: 1
+envelope: {{protos: {ROOT}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
+listen:
+  old: {{address: 0.0.0.0:25000}}
+  new: {{address: "[::]:25000"}}
+  late: {{address: "[fe80::1%nowhere0]:25001"}}
+endpoints: {{board: {{address: "[fd00::30]:8", kind: board}}, other: {{address: 10.0.0.1:8, kind: tool}}}}
+routes: {{drive_diag: {{source: board, destinations: [other]}}}}
+"""
+    running.shell(f"cat > /opt/six.yaml <<'END'\n{table}END\n{ROOT}/deploy/install-service.sh /opt/six.yaml")
+    assert running.state() == running.state("rover-router.socket") == "active"
+    lines = running.shell("ss -lunpH 'sport = :25000'").splitlines()
+    held = [line for line in lines if '"systemd"' in line]
+    assert sorted(line.split()[3] for line in held) == ["0.0.0.0:25000", "[::]:25000"]
+    assert all(f"pid={running.show('MainPID')}" in line for line in lines)
+    assert "fe80" not in running.shell("systemctl cat rover-router.socket")
+    told = running.journal().rpartition("install-service")[2]
+    assert "uses this inherited socket" not in told
+    assert "BindIPv6Only" not in told
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
+
+
 BOARD = """import os, shutil, time
 board, device = os.openpty()
 shutil.chown(os.ttyname(device), "root", "dialout")

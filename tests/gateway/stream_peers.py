@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager, suppress
 from router.gateway.transport.stream import Limits, StreamTransport
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.websocket import WebsocketTransport
+from router.net.addresses import family
 from router.net.doors import Door
 from router.table.addresses import Address
 from tests.gateway.transport_events import Events, opened
@@ -41,10 +42,12 @@ def transport_of(
 
 
 @asynccontextmanager
-async def served(kind: str, limits: Limits = TEN, door: Door = OPEN) -> AsyncIterator[tuple[StreamTransport, Events]]:
+async def served(
+    kind: str, limits: Limits = TEN, door: Door = OPEN, address: Address = ANY
+) -> AsyncIterator[tuple[StreamTransport, Events]]:
     """An open transport and its events."""
     events = Events()
-    transport = transport_of(kind, events, limits, door=door)
+    transport = transport_of(kind, events, limits, address, door)
     async with opened(transport):
         yield transport, events
 
@@ -70,7 +73,7 @@ class Peer:
 
     def __init__(self, kind: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.writer = writer
-        self.label = "{}:{}".format(*writer.get_extra_info("sockname"))
+        self.label = str(Address(*writer.get_extra_info("sockname")[:2]))
         self._kind = kind
         self.reader = reader
 
@@ -120,10 +123,10 @@ class Peer:
         self.writer.transport.abort()
 
 
-async def join(kind: str, transport: StreamTransport, host: str = "127.0.0.1") -> Peer:
+async def join(kind: str, transport: StreamTransport, host: str = ANY.host) -> Peer:
     """Connect from a local address, with a small receive buffer, and shake hands."""
     assert transport.address is not None
-    opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    opened = socket.socket(family(host), socket.SOCK_STREAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     opened.setblocking(False)
     opened.bind((host, 0))

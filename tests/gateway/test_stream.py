@@ -7,12 +7,13 @@ import socket
 import struct
 from collections import Counter
 from contextlib import ExitStack, suppress
-from ipaddress import IPv4Network
+from ipaddress import IPv4Network, IPv6Network
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.errors import StartError
+from router.gateway.transport import binding as gateway_binding
 from router.gateway.transport import stream as gateway_stream
 from router.gateway.transport import tcp as gateway_tcp
 from router.gateway.transport import websocket as gateway_websocket
@@ -20,6 +21,7 @@ from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
 from router.gateway.transport.stream import MESSAGE_SECONDS, Limits, StreamTransport
 from router.net import doors
 from router.net.doors import Door
+from router.table.addresses import Address
 from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
 from tests.gateway.stream_peers import GREETING, KINDS, MOST, framed, join, served, transport_of, websocket_frame
 from tests.gateway.transport_events import Events, data, opened, resident_kib
@@ -320,6 +322,43 @@ async def test_closing_ends_although_clients_are_just_coming(kind: str, turns: i
         for _ in range(turns):
             await asyncio.sleep(0)
         await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
+
+
+@EACH_KIND
+@asynchronous
+async def test_clients_come_by_ipv6(kind: str) -> None:
+    door = Door("gateways.test", [IPv6Network("fd00::/64")], Counter())  # and from the own computer
+    async with served(kind, Limits(3, 1, MOST), door, Address("::1", 0)) as (transport, events):
+        peer = await join(kind, transport, "::1")
+        await until(lambda: events.clients)
+        assert str(transport.address).startswith("[::1]:")
+        assert [client.label for client in events.clients] == [peer.label]
+        assert peer.label.startswith("[::1]:")
+        await peer.say(b"hello")
+        events.clients[0].write([data(b"welcome")])
+        assert await peer.hear() == b"welcome"
+        await until(lambda: events.said == [b"hello"])
+        second = await join(kind, transport, "::1")
+        assert await second.is_closed()
+        second.leave()
+        again = transport_of(kind, Events(), address=transport.address or pytest.fail("it is open"))
+        with pytest.raises(StartError, match=r"\[::1\]:\d+ cannot be used: .* has the port"):
+            await again.open()
+        peer.leave()
+
+
+@EACH_KIND
+@asynchronous
+async def test_an_interface_of_a_link_local_address_is_waited_for(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_binding, "RETRY_SECONDS", 0.01)
+    transport = transport_of(kind, Events(), address=Address("fe80::1%nowhere0", 8500))
+    with capture_logs() as logs:
+        async with opened(transport):
+            await asyncio.sleep(0.1)
+            assert transport.address is None
+            monkeypatch.setattr(transport, "_requested", Address("::1", 0))  # the interface comes up
+            await until(lambda: transport.address)
+    assert [log["log_level"] for log in logs] == ["warning", "info"]
 
 
 @EACH_KIND

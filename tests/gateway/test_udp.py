@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 
 import pytest
 from structlog.testing import capture_logs
@@ -17,27 +18,34 @@ from router.gateway.transport import binding as gateway_binding
 from router.gateway.transport import udp as gateway_udp
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER
 from router.gateway.transport.udp import UdpTransport
+from router.net.addresses import family
 from router.table.addresses import Address
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.transport_events import Events, data, opened
-from tests.namespaces import narrow_path
+from tests.namespaces import Computer, cable, computers, narrow_path
 from tests.ports import free_port
 
 
 @pytest.fixture
 def headset() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        peer.bind(("127.0.0.1", 0))
+    with headset_at("127.0.0.1") as peer:
+        yield peer
+
+
+@contextmanager
+def headset_at(host: str) -> Iterator[socket.socket]:
+    with socket.socket(family(host), socket.SOCK_DGRAM) as peer:
+        peer.bind((host, 0))
         peer.settimeout(10)
         yield peer
 
 
 def address_of(peer: socket.socket) -> Address:
-    return Address(*peer.getsockname())
+    return Address(*peer.getsockname()[:2])
 
 
-def local() -> Address:
-    return Address("127.0.0.1", free_port())
+def local(host: str = "127.0.0.1") -> Address:
+    return Address(host, free_port(host))
 
 
 @asynccontextmanager
@@ -82,6 +90,57 @@ async def test_the_clients_host_is_heard_from_any_port_and_nobody_else(headset: 
         await until(lambda: len(events.said) == 3)
         assert events.said == [b"hello", b"x" * 65507, b""]
         assert events.refusals == ["source_mismatch"]
+
+
+@pytest.mark.parametrize("local_host", ["::1", "::", None])
+@asynchronous
+async def test_a_client_has_an_ipv6_address(local_host: str | None) -> None:
+    with headset_at("::1") as headset:
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(local_host) if local_host else None, events)
+        async with opened(transport):
+            [client] = events.clients
+            assert client.label == f"[::1]:{headset.getsockname()[1]}"
+            client.write([data(b"one")])
+            heard, sender = await hear(headset)
+            assert (heard, sender[0]) == (b"one", "::1")
+            headset.sendto(b"hello", sender)
+            await until(lambda: events.said or not local_host)
+            assert events.said == [b"hello"] * bool(local_host)
+
+
+def say_from(interface: str) -> None:
+    index = socket.if_nametoindex(interface)
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as headset:
+        headset.bind(("fe80::2", 9001, 0, index))
+        headset.sendto(interface.encode(), ("fe80::1", 8500, 0, index))
+
+
+def test_a_link_local_client_is_heard_on_its_interface_only() -> None:
+    async def serve(near: Computer) -> tuple[list[bytes], list[str]]:
+        events = Events()
+        async with opened(UdpTransport(Address("fe80::2%eth0", 9000), Address("::", 8500), events)):
+            [client] = events.clients
+            client.write([data(b"one")])
+            assert (await hear(headset))[0] == b"one"
+            far.inside(lambda: say_from("eth1"))
+            await until(lambda: events.refusals)
+            far.inside(lambda: say_from("eth0"))
+            await until(lambda: events.said)
+            near.ip("link", "del", "eth0")
+            client.write([data(b"lost")])
+            [(_, error, lost)] = events.failures
+            assert isinstance(error, OSError)
+            assert (error.errno, lost) == (errno.ENODEV, 1)
+        return events.said, events.refusals
+
+    with computers("near", "far") as (near, far):
+        for interface in ("eth0", "eth1"):
+            cable(near, interface, "fe80::1/64", far, interface, "fe80::2/64")
+        with far.inside(lambda: socket.socket(socket.AF_INET6, socket.SOCK_DGRAM)) as headset:
+            headset.bind(("::", 9000))
+            headset.settimeout(10)
+            assert near.inside(lambda: asyncio.run(serve(near))) == ([b"eth0"], ["source_mismatch"])
 
 
 @asynchronous

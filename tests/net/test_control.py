@@ -49,3 +49,14 @@ def test_the_owner_waits_until_there_is_room(listening: socket.socket, port: int
 def test_the_owner_does_not_wait_for_ever(listening: socket.socket, port: int) -> None:
     with pytest.raises(BlockingIOError):
         control.connect(HOST, port, 0.1)
+
+
+@pytest.mark.parametrize("host", ["::1", "::"])
+def test_a_router_at_an_ipv6_address_is_found(host: str) -> None:
+    port = free_port(kind=socket.SOCK_STREAM)
+    with closing(control.listen(host, port)):
+        control.connect("::1", port, 10).close()
+        with pytest.raises(ConnectionRefusedError):
+            control.connect("127.0.0.1", port, 10)
+        with pytest.raises(OSError, match="assign requested address"):  # another computer's
+            control.connect("2001:db8::77", port, 10)

@@ -90,6 +90,11 @@ def test_a_gateway_that_receives_at_one_is_named(tmp_path: Path) -> None:
     assert str(clash).startswith("gateway 'g' has 127.0.0.1:7400, the port through which ROS processes of domain 0")
 
 
+def test_ros_uses_ipv4_ports_only(tmp_path: Path) -> None:
+    gateway = "gateways: {g: {transport: {udp: '[::1]:8502'}, receive: '[::1]:7400', topics: {include: [/a]}}}\n"
+    assert list(clashes(compiled(table(tmp_path, 5000, TO_ROS + gateway)), {})) == []
+
+
 def test_ros_binds_the_ports_that_are_taken_for_its_own(tmp_path: Path) -> None:
     """One more than the standard of DDS says, from 7000 on."""
     pytest.importorskip("rclpy", reason="needs ROS 2")

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import socket
 from collections import Counter
-from ipaddress import IPv4Network
+from ipaddress import IPv4Network, IPv6Network
 
 import pytest
 from structlog.testing import capture_logs
 
-from router.net.doors import Door, is_foreign, is_own_computer
+from router.errors import SourceSpan, StartError
+from router.net.addresses import bound_address
+from router.net.doors import Door, is_foreign, is_own_computer, listen
+from router.table.addresses import Address
+
+SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 
 
 @pytest.mark.parametrize(
@@ -18,6 +24,9 @@ from router.net.doors import Door, is_foreign, is_own_computer
         ("127.0.7.1", "127.0.0.1", True),
         ("192.168.0.5", "192.168.0.5", True),
         ("192.168.0.6", "192.168.0.5", False),
+        ("::1", "::1", True),
+        ("fd00::5", "fd00::5", True),
+        ("fd00::6", "fd00::5", False),
     ],
 )
 def test_own_computer_is_told_by_both_addresses(peer: str, own: str, is_own: bool) -> None:
@@ -36,6 +45,28 @@ def test_door_admits_its_networks_and_the_own_computer_and_counts_the_others() -
         door.close()
     assert refused == {"http": 3}
     assert (logs[-1]["client"], logs[-1]["more"]) == ("10.0.0.8", 1)
+
+
+def test_door_knows_networks_of_both_families() -> None:
+    refused = Counter[str]()
+    door = Door("http", [IPv4Network("192.168.0.0/24"), IPv6Network("fd00::/64")], refused)
+    for peer in ("192.168.0.1", "fd00::7", "::1"):
+        assert door.admits(peer, "fd01::1")
+    for peer in ("192.168.1.1", "fd01::7", "fe80::1", "::ffff:192.168.0.1"):
+        assert not door.admits(peer, "fd01::1")
+    assert refused == {"http": 4}
+
+
+@pytest.mark.parametrize("host", ["::1", "::"])
+def test_an_ipv6_server_takes_no_ipv4(host: str) -> None:
+    with listen(Address(host, 0), SPAN, "HTTP", "http.address") as server:
+        port = bound_address(server)[1]
+        with socket.create_connection(("::1", port), timeout=10):
+            pass
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port), timeout=10)
+        with pytest.raises(StartError, match=rf"cannot serve HTTP at \[{host}\]:{port}: .* has the port"):
+            listen(Address(host, port), SPAN, "HTTP", "http.address")
 
 
 def test_strangers_without_end_are_counted_and_take_a_bounded_number_of_lines() -> None:
@@ -60,6 +91,8 @@ def test_door_without_networks_admits_everybody() -> None:
         ("192.168.0.5:8765", ["http://192.168.0.5:8765"], False),
         ("192.168.0.5", ["https://192.168.0.5"], False),
         ("[fe80::1]:8765", ["http://[fe80::1]:8765"], False),
+        ("[::1]", ["http://[::1]"], False),
+        ("[fd00::1]:8765", ["http://[fd00::2]:8765"], True),
         ("Rover:8765", ["http://rover:8765"], False),
         ("rover.local", ["https://rover.local"], False),
         ("192.168.0.5:8765", ["http://192.168.0.5:8080"], True),

@@ -18,10 +18,11 @@ from router.errors import Located, SourceSpan, StartError
 from router.net import sockets, udp
 from router.net.kernel import SO_TIMESTAMPNS
 from router.net.sockets import Inherited
-from router.net.udp import Listener, absence, why_unreachable
+from router.net.udp import Listener, absence, usual_source, why_not_sent, why_unreachable
 from router.table.addresses import Address, BadAddressError
 from router.table.model import endpoints
 from router.table.model.endpoints import EndpointKind, Framing
+from tests.namespaces import cable, computers
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000
@@ -65,7 +66,11 @@ def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: sock
     assert (received, listener.socket.recvfrom(LIMIT)) == ((b"before", peer.getsockname()), (b"", None))
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "127.255.255.255"], ids=["all interfaces", "a broadcast address"])
+@pytest.mark.parametrize(
+    "host",
+    ["0.0.0.0", "127.255.255.255", "::", "::1"],
+    ids=["all interfaces", "a broadcast address", "all of IPv6", "IPv6"],
+)
 def test_a_listener_on_more_than_one_address_ends_too(stack: ExitStack, host: str) -> None:
     listener = stack.enter_context(closing(Listener(plan(host=host))))
     listener.end_input()
@@ -127,10 +132,11 @@ def _drain(nonblocking: socket.socket) -> int:
     raise AssertionError("a datagram was empty")
 
 
-def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
-    taken = listen(stack).address
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack, host: str) -> None:
+    taken = stack.enter_context(closing(Listener(plan(host=host)))).address
     with pytest.raises(StartError) as refused:
-        Listener(plan(port=taken.port))
+        Listener(plan(host=host, port=taken.port))
     assert str(refused.value) == (
         f"routes/rover.yaml:12:20: listener 'rover' cannot use {taken}: "
         f"the router itself (pid {os.getpid()}) has the port; restart it, or choose another port"
@@ -149,6 +155,8 @@ def test_the_port_of_a_listener_that_accepts_nothing_new_is_the_routers(stack: E
     ("settings", "why"),
     [
         (plan(host="192.0.2.77", port=5000), "no network interface of this computer has that address"),
+        (plan(host="2001:db8::77", port=5000), "no network interface of this computer has that address"),
+        (plan(host="fe80::77%nowhere0", port=5000), "there is no such network interface"),
         (replace(plan(), interface="nowhere0"), "there is no such network interface"),
     ],
 )
@@ -173,6 +181,44 @@ def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack)
 def test_a_broadcast_destination_is_no_machine() -> None:
     with pytest.raises(BadAddressError, match=r"127.255.255.255 is not the address of a single machine"):
         why_unreachable(Address("127.255.255.255", 9))
+
+
+@pytest.mark.parametrize(
+    ("host", "code", "why"),
+    [
+        ("fd00::2", errno.ENETUNREACH, "no route leads to fd00::2, or it does not answer: `ip route get fd00::2`"),
+        ("fe80::2%eth0", errno.EACCES, "prohibits sending to fe80::2%eth0: `ip route get fe80::2 oif eth0`"),
+        ("fe80::2%eth0", errno.EINVAL, "the network interface eth0 is missing: `ip link`"),
+        ("fd00::2", errno.EADDRNOTAVAIL, "has no address from which it can send to fd00::2: `ip address`"),
+        ("fd00::2", errno.ECONNREFUSED, "nobody listens at [fd00::2]:9"),
+    ],
+)
+def test_why_nothing_was_sent_to_an_ipv6_host(host: str, code: int, why: str) -> None:
+    assert why_not_sent(OSError(code, "?"), Address(host, 9)).endswith(why)
+
+
+def test_routes_to_ipv6_hosts_are_known(stack: ExitStack) -> None:
+    rover, station = stack.enter_context(computers("rover", "station"))
+
+    def answers(host: str) -> tuple[object, object]:
+        to = Address(host, 9)
+        return rover.inside(lambda: (usual_source(to), why_unreachable(to)))
+
+    no_route = "no route leads there", "check the cable, and that `ip address` shows an interface in its network"
+    assert answers("::1") == ("::1", None)
+    assert answers("fd00::2") == (None, no_route)
+    assert answers("fe80::2%lan") == (
+        None,
+        ("there is no such network interface", "run `ip link` to list the interfaces"),
+    )
+    cable(rover, "lan", "fd00::1/64", station, "eth0", "fd00::2/64")
+    assert answers("fd00::2") == ("fd00::1", None)
+    assert answers("fe80::2%lan")[1] is None
+    rover.ip("route", "add", "prohibit", "fd01::/64")
+    assert answers("fd01::2")[1] == (
+        "the kernel refuses it: permission denied",
+        "run `ip route get fd01::2` to see which route refuses it",
+    )
 
 
 # sockets of a service manager
@@ -206,6 +252,21 @@ def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listene
     assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
 
 
+def test_an_ipv6_socket_that_also_has_the_ipv4_port_is_told(monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
+    """Without BindIPv6Only=ipv6-only, systemd binds it so."""
+    for is_only in (0, 1):
+        held = stack.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
+        held.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, is_only)
+        held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        held.bind(("::", 0))
+        ours = Inherited([held.dup()])
+        monkeypatch.setattr(sockets, "inherited", lambda ours=ours: ours)
+        with capture_logs() as logged:
+            stack.enter_context(closing(Listener(plan(host="::", port=held.getsockname()[1]))))
+        assert ["BindIPv6Only=ipv6-only" in each["remedy"] for each in logged] == [True] * (not is_only)
+        assert udp.unclaimed() == []
+
+
 def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
     others = [
         stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM)
@@ -218,4 +279,4 @@ def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.Monk
     stack.enter_context(closing(Listener(plan_of(held))))
     beside, stream = udp.unclaimed()
     assert beside == f"{Address(*others[0].getsockname())} on lo"
-    assert stream.endswith("which is not an IPv4 UDP socket")
+    assert stream.endswith("which is not a UDP socket")

@@ -333,6 +333,14 @@ def handshake(server: FoxgloveServer, host: str = "", *, subprotocol: str = SUBP
         return connection.recv(65536).startswith(b"HTTP/1.1 101 ")
 
 
+def test_pages_of_the_same_host_can_look_at_an_ipv6_address(router: Showing) -> None:
+    with closing(serve(router, Address("::1", 0), [IPv4Network("10.0.0.0/8")])) as server:
+        assert str(server.address).startswith("[::1]:")
+        assert handshake(server)
+        assert handshake(server, Origin=f"http://{server.address}")
+        assert not handshake(server, Origin="http://[fd00::1]:8766")
+
+
 def test_the_app_and_pages_of_the_same_host_can_look(server: FoxgloveServer) -> None:
     assert handshake(server)
     assert handshake(server, subprotocol="foxglove.websocket.v1")

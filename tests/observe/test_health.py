@@ -313,6 +313,11 @@ def test_of_many_strangers_a_few_are_named(router: Counting) -> None:
     assert rejected.more.endswith("; and 17 more")
 
 
+def test_tcpdump_takes_no_interface_in_an_address() -> None:
+    remedy = Kind.ENDPOINT_SILENT.remedy_at("fe80::1%eth0")
+    assert "`ping fe80::1%eth0`, `tcpdump -n udp and host fe80::1`" in remedy
+
+
 def test_where_all_are_silent_it_is_the_network(router: Counting) -> None:
     assert {problem.remedy.partition(":")[0] for problem in router.look(1000).problems} == {"All endpoints are silent"}
 

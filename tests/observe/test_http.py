@@ -104,6 +104,20 @@ def order(server: HttpServer, path: str) -> Answer:
         return Answer(connection.getresponse())
 
 
+def test_it_serves_at_an_ipv6_address(running: FakeRunning) -> None:
+    networks = [IPv4Network("10.0.0.0/8")]  # and the own computer
+    with closing(served(running, lambda _: Path("last.mcap"), Address("::1", 0), networks=networks)) as server:
+        assert str(server.address).startswith("[::1]:")
+        assert ask(server, "/status.json").status == 200
+        assert ask(server, "/status.json", headers={"Host": "rover.example.org"}).status == 403
+        own = {"Host": str(server.address), "Origin": f"http://{server.address}", "Sec-Fetch-Site": "same-origin"}
+        assert ask(server, "/record/save", "POST", own).status == 200
+        assert ask(server, "/record/save", "POST", {**own, "Origin": "http://[fd00::1]:9108"}).status == 403
+        assert order(server, "/-/reload").status == 200
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", server.address.port), 10)
+
+
 def test_target_may_be_a_whole_url_and_its_host_counts(server: HttpServer) -> None:
     for target, answer in (("http://rover:9108/status.json", 200), ("http://rover.example.org/status.json", 403)):
         with closing(connected(server)) as connection:

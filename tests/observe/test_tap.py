@@ -86,18 +86,22 @@ def test_a_tap_shows_actions_unless_it_is_limited_to_what_was_received(running: 
         assert [type(each) for each in read(tap.stream(), 1)] == [MirroredDatagram]
 
 
+EVERYBODY = ["board imu", "board gps", "station imu", "stranger imu", "IPv6 imu", "link-local imu", "board junk"]
+
+
 @pytest.mark.parametrize(
     ("cases", "sources", "decisions", "shown"),
     [
-        ((), (), (), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
+        ((), (), (), EVERYBODY),
         (("gps_info",), (), (), ["board gps", "board junk"]),
         (("gps_info", "imu_info"), ("basestation",), (), ["station imu"]),
         ((), ("sensor_board",), (), ["board imu", "board gps", "board junk"]),
         ((), ("127.0.0.99", "basestation"), (), ["station imu", "stranger imu"]),
+        ((), ("FD00:0::99", "fe80::1%eth0"), (), ["IPv6 imu", "link-local imu"]),
         ((), (), ("accepted",), ["board imu", "board gps"]),
-        ((), (), ("rejected",), ["station imu", "stranger imu", "board junk"]),
+        ((), (), ("rejected",), EVERYBODY[2:]),
         (("imu_info",), ("sensor_board", "127.0.0.99"), ("rejected",), ["stranger imu", "board junk"]),
-        ((), (), ("accepted", "rejected"), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
+        ((), (), ("accepted", "rejected"), EVERYBODY),
     ],
 )
 def test_a_tap_shows_some_cases_or_senders_or_decisions_only(
@@ -108,6 +112,8 @@ def test_a_tap_shows_some_cases_or_senders_or_decisions_only(
         "board gps": MirroredDatagram(0, "rover", BOARD, "sensor_board", "", GPS),
         "station imu": MirroredDatagram(0, "rover", STATION, "basestation", "source_mismatch", IMU),
         "stranger imu": MirroredDatagram(0, "rover", STRANGER, "", "source_mismatch", IMU),
+        "IPv6 imu": MirroredDatagram(0, "rover", ("fd00::99", 1), "", "source_mismatch", IMU),
+        "link-local imu": MirroredDatagram(0, "rover", ("fe80::1%eth0", 1), "", "source_mismatch", IMU),
         "board junk": MirroredDatagram(0, "rover", BOARD, "sensor_board", "malformed", b"\xff\xff\xff"),
     }
     wants = wanted(PROGRAM, cases, sources, decisions)
@@ -119,6 +125,8 @@ def test_a_name_that_there_is_not_is_refused() -> None:
         wanted(PROGRAM, ["imu_inf"], [])
     with pytest.raises(TapRequestError, match="no endpoint 'sensor_bord'; did you mean 'sensor_board'"):
         wanted(PROGRAM, [], ["sensor_bord"])
+    with pytest.raises(TapRequestError, match=r"fe80::1 is link-local, .*; write its network interface"):
+        wanted(PROGRAM, [], ["fe80::1"])
     with pytest.raises(TapRequestError, match="'only' must be accepted or rejected, not 'reject'"):
         wanted(PROGRAM, [], [], ["reject"])
 
@@ -162,7 +170,7 @@ def test_a_quiet_tap_says_that_it_is_there_and_ends_when_it_is_closed(
 
 # ---- the stream -------------------------------------------------------------------------------------------------
 
-HOSTS = st.tuples(*[st.integers(0, 255)] * 4).map(lambda parts: ".".join(map(str, parts)))
+HOSTS = st.one_of(st.ip_addresses().map(str), st.ip_addresses(v=6).map(lambda address: f"{address}%wlan0"))
 SEEN = st.builds(
     MirroredDatagram,
     st.integers(0, 2**64 - 1),
@@ -195,7 +203,7 @@ def test_what_a_newer_router_says_is_passed_over() -> None:
     assert list(StreamReader().take(MAGIC + unknown + encode_lost(7))) == [Lost(7)]
 
 
-@pytest.mark.parametrize("stream", [b"<!doctype html>", b"router tap 1\n"])
+@pytest.mark.parametrize("stream", [b"<!doctype html>", b"router tap 2\n"])
 def test_another_stream_is_refused(stream: bytes) -> None:
     with pytest.raises(TransportError, match="not a tap stream"):
         list(StreamReader().take(stream))

@@ -24,7 +24,7 @@ from router.recording.recorder import Recorder
 from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
-from router.table.model.endpoints import Endpoint, EndpointKind, Framing
+from router.table.model.endpoints import Endpoint, EndpointKind, Framing, Listener
 from router.table.model.settings import RecordSettings
 from tests.tables import PROTOS
 
@@ -74,7 +74,7 @@ def endpoints() -> dict[str, Endpoint]:
 
 def table(**changed: Any) -> RouteTable:
     """The part of a table that a recording contains."""
-    listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
+    listener = Listener("rover", SPAN, Located(Address("0.0.0.0", 5000), SPAN), framing=Framing.ZERO_TRIMMED)
     told = {
         "path": Path("routes/rover.yaml"),
         "endpoints": endpoints(),

@@ -421,6 +421,16 @@ IN_MEANING = [
     ("{given: {case: imu_info, from: sensor}, expect: nothing}", Code.UNKNOWN_ENDPOINT, "'sensor'"),
     ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "name the listener"),
     ("{given: {case: imu_info, from: sensor_board, listener: x}, expect: nothing}", Code.BAD_VALUE, "listener 'x'"),
+    (
+        "{given: {case: imu_info, from: 'fd00::1', listener: exact}, expect: nothing}",
+        Code.BAD_VALUE,
+        "nothing arrives from fd00::1 at 'exact'",
+    ),
+    (
+        "{given: {case: imu_info, from: '[fd00::1]', listener: exact}, expect: nothing}",
+        Code.UNKNOWN_ENDPOINT,
+        "neither HOST[:PORT] nor a name",
+    ),
     ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
     (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
     (f"{{given: {given('{accel_x: 1e39}')}, expect: nothing}}", Code.BAD_VALUE, "does not fit float32"),

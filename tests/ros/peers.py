@@ -8,7 +8,6 @@ for each publisher that it finds, and each message's bytes in hex. Both exit whe
 from __future__ import annotations
 
 import argparse
-import select
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -23,6 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 sys.path.insert(0, str(Path(__file__).parents[2]))  # sys.path of a script lacks the repository's root
 
 from router.ros.types import installed_class
+from tests.readable import readable
 from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
 
 
@@ -109,7 +109,7 @@ def main() -> None:
             print("acknowledged", file=lines)
         if line:
             publisher.publish(bytes.fromhex(line))
-        while arguments.flood and not select.select([sys.stdin], [], [], 0)[0]:
+        while arguments.flood and not readable(sys.stdin.fileno()):
             publisher.publish(bytes.fromhex(line))
 
     spin_until_stdin_ends(node, publish)

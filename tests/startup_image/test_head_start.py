@@ -12,6 +12,7 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
@@ -170,11 +171,11 @@ def test_a_socket_that_a_head_start_sends_by_is_closed_once_no_thread_uses_it(
     program = site.program(DRIVING)
 
     def open_elsewhere(
-        source: ListeningSocket | None, every: Collection[ListeningSocket] = (), *, is_board: bool = False
+        source: ListeningSocket | None, every: Collection[ListeningSocket] = (), **settings: Any
     ) -> socket.socket:
         if source is not None:
             raise OSError("the port of the listener cannot be shared")
-        return open_sending(None, every, is_board=is_board)
+        return open_sending(None, every, **settings)
 
     monkeypatch.setattr(head_starts, "open_sending", open_elsewhere)
     started = head_start(program)

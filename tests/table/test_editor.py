@@ -171,7 +171,7 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
     ("table", "right", "wrong", "blamed", "message"),
     [
         (GOOD, "kind: board", "kid: board", "kid", "Property kid is not allowed."),
-        (GOOD, "192.168.0.30:8", "192.168.0.30:", "192.168.0.30:", "must be an IPv4 address or a host name"),
+        (GOOD, "192.168.0.30:8", "192.168.0.30:", "192.168.0.30:", "must be an IP address or a host name"),
         (GOOD, "queue_depth: 10", "queue_depth: ten", ": ten", 'Incorrect type. Expected "integer"'),
         (GOOD, "exact", "exat", "exat", 'Valid values: "zero_trimmed", "exact"'),
         (GOOD, "500ms", "500 millis", "500 millis", "must be a duration above zero with its unit"),
@@ -190,7 +190,7 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (GATEWAYS, "50 Hz", "50 Hertz", "rates", "such as '50 Hz', or 'each'"),
         (GATEWAYS, "zstd: ${LEVEL:-3}", "zstd: 30", "zstd", "maximum of 22"),
         (PART, "receive_buffer:", "receive_bufer:", "receive_bufer", "Property receive_bufer is not allowed."),
-        (PART, "[127.0.0.0/8", "[localhost", "networks", "must be an IPv4 network"),
+        (PART, "[127.0.0.0/8", "[localhost", "networks", "must be a network"),
         # Lists are not merged, so what stands in one has to be complete.
         (PART, ", send: {manual_brake: {}}", "", "deadman: {timeout: 200ms", 'Missing property "send"'),
         (PART, "topic: brake, ", "", "type: std_msgs/msg/Bool", 'Missing property "topic"'),

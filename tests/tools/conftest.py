@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from router.datagrams import Wire, wire_of_protos
+from router.net.addresses import host_and_port
 from router.table import read_table
+from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.types.protobuf import PayloadCase
 from tests.ports import free_port
@@ -83,15 +85,21 @@ def line_path(table_path: Callable[..., Path]) -> Path:
 
 @pytest.fixture
 def tcp_path(table_path: Callable[..., Path]) -> Callable[[str], Path]:
-    """Write the same table with the board, and `other` if it is a server, over TCP: of `connect` or `accept`."""
+    """Write the same table with the board, and `other` if it is a server, over TCP: of `connect` or `accept`.
+
+    With IPv6, there is no `other`: a computer has only one loopback address.
+    """
 
     def write(way: str) -> Path:
-        path = table_path()
-        tcp = f"127.0.0.1:{free_port('127.0.0.1', socket.SOCK_STREAM)}"
+        way, _, is_ipv6 = way.partition(" ")
+        path, host = table_path(), "::1" if is_ipv6 else "127.0.0.1"
+        tcp = Address(host, free_port(host, socket.SOCK_STREAM))
         link = f'  tcp: {{{way}: "{tcp}", framing: {{length: u16be}}, checksum: crc32}}\n'
         text = path.read_text().replace("endpoints:\n", f"{link}endpoints:\n", 1)
         address = "address: 127.0.6.30, " if way == "accept" else ""
         other = "  other: {address: 127.0.6.31, listener: tcp, kind: board}\n" if way == "accept" else ""
+        if is_ipv6:
+            address, other = address.replace("127.0.6.30", '"::1"'), ""
         text = text.replace("  station:", f"{other}  station:", 1)
         path.write_text(re.sub("address: 127.0.6.30:[0-9]+", f"{address}listener: tcp", text))
         return path
@@ -108,5 +116,4 @@ def receiver() -> Iterator[socket.socket]:
 
 
 def place(receiver: socket.socket) -> str:
-    host, port = receiver.getsockname()
-    return f"{host}:{port}"
+    return str(Address(*host_and_port(receiver.getsockname())))

@@ -20,6 +20,7 @@ from router.compiler.compiled_table import CompiledTable
 from router.errors import StartError
 from router.observe.problems import Kind, Problem
 from router.recording.writer import RecordingDirectory
+from router.table.addresses import Address
 from router.table.model.endpoints import Endpoint
 from router.tools import doctor_checks, name_checks
 from router.tools.doctor import before_start, examine
@@ -43,6 +44,7 @@ from router.tools.doctor_checks import (
     warning,
 )
 from router.tools.name_checks import Names
+from router.tools.udp import open_udp
 from tests.ports import free_port
 from tests.tools.answering import answering
 
@@ -179,6 +181,22 @@ def test_a_port_that_somebody_has_is_told_with_his_name_and_may_be_the_services(
         monkeypatch.setattr(doctor_checks, "port_holder", lambda *_: "systemd (pid 1)")
         assert gist(ports(program, running=False), "systemctl start rover-router") == [(Grade.FINE, True)]
     assert gist(ports(program, running=False), "free: ") == [(Grade.FINE, True)]
+
+
+def test_a_port_of_ipv4_is_free_for_ipv6_until_somebody_has_that(table: Path) -> None:
+    port = free_port("::")
+    program = rewritten(table, "listen: {", f'listen: {{six: {{address: "[::]:{port}"}}, ')
+    with open_udp(Address("0.0.0.0", port), "IPv4"):
+        assert gist(ports(program, running=False), f", [::]:{port}") == [(Grade.FINE, True)]
+    with open_udp(Address("::", port), "IPv6"):
+        assert gist(ports(program, running=False), f"has udp port {port}") == [(Grade.PROBLEM, True)]
+
+
+def test_the_interface_of_a_link_local_address_must_be_there(table: Path) -> None:
+    program = rewritten(table, "http: {", 'foxglove: {address: "[fe80::1%nowhere0]:8765"}\nhttp: {')
+    [found] = ports(program, running=False)
+    assert found.text == "foxglove.address: no interface of this computer has fe80::1%nowhere0"
+    assert found.remedy.endswith("or write [::] in the table")
 
 
 @pytest.mark.parametrize(
@@ -468,7 +486,9 @@ def test_a_broadcast_address_is_a_problem(table: Path) -> None:
 
 def test_who_answers_a_ping() -> None:
     try:
-        assert doctor_checks.answering({"127.0.0.30", "127.0.0.40"}) == {"127.0.0.30", "127.0.0.40"}
+        assert doctor_checks.answering({"127.0.0.30", "::1", "127.0.0.40"}) == {"127.0.0.30", "::1", "127.0.0.40"}
+        assert doctor_checks.answering({"::1"}) == {"::1"}
+        assert doctor_checks.answering({"127.0.0.30", "fe80::1%nowhere0"}, 0.05) == {"127.0.0.30"}
     except PermissionError:
         pytest.skip("this user may not ping")
 

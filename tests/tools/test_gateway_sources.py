@@ -17,10 +17,12 @@ from websockets.sync.server import ServerConnection, serve
 
 from router.errors import Located, UsageError
 from router.gateway.packets import unpack
+from router.net.addresses import family, host_and_port
 from router.table.addresses import Address
 from router.table.model.gateways import GatewayFormat, ZenohSettings
 from router.tools import gateway_sources
 from router.tools.gateway_sources import Source, Splitter, TcpSource, UdpSource, WebsocketSource, open_source
+from router.tools.udp import address_of, open_udp
 from router.tools.zenoh_source import ZenohSource
 from tests.ports import free_port
 
@@ -48,9 +50,11 @@ def until(source: Source, condition: Callable[[], object]) -> None:
 
 @contextmanager
 def udp_source(said: Said, gateway: Address | None = None) -> Iterator[tuple[UdpSource, Address]]:
-    port = free_port()
-    with closing(UdpSource(Address("127.0.0.1", port), gateway, said.append)) as source:
-        yield source, Address("127.0.0.1", port)
+    host = gateway.host if gateway is not None else "127.0.0.1"
+    address = Address(host, free_port(host))
+    with closing(UdpSource(address, gateway, said.append)) as source:
+        assert source.place == f"udp {address}"
+        yield source, address
 
 
 @contextmanager
@@ -71,14 +75,14 @@ def test_udp_takes_whole_datagrams_of_any_size(said: Said) -> None:
         assert source.lost == 0
 
 
-def test_udp_asks_from_the_port_on_which_it_listens(said: Said) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
-        gateway.bind(("127.0.0.1", 0))
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_udp_asks_from_the_port_on_which_it_listens(said: Said, host: str) -> None:
+    with open_udp(Address(host, 0), "gateway") as gateway:
         gateway.settimeout(5)
-        with udp_source(said, Address(*gateway.getsockname())) as (source, address):
+        with udp_source(said, address_of(gateway)) as (source, address):
             source.ask()
             data, peer = gateway.recvfrom(100)
-    assert peer == address
+    assert peer[:2] == address
     assert unpack(data)[1:] == (False, "", "", b"")
 
 
@@ -138,12 +142,13 @@ def test_tcp_connects_again_when_the_gateway_went_away(port: socket.socket, said
     assert first.sender != second.sender
 
 
-def test_tcp_waits_for_a_gateway_that_is_not_there_and_says_so_once(said: Said) -> None:
-    address = Address("127.0.0.1", free_port(kind=socket.SOCK_STREAM))
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_tcp_waits_for_a_gateway_that_is_not_there_and_says_so_once(said: Said, host: str) -> None:
+    address = Address(host, free_port(host, socket.SOCK_STREAM))
     with closing(TcpSource(address, None, said.append)) as source:
         for _ in range(3):
             source.arrivals(0.05)
-        with socket.create_server(address):
+        with socket.create_server(address, family=family(host)):
             until(source, lambda: len(said) > 1)
     assert said == [
         f"tcp {address} cannot be reached (Connection refused); trying again",
@@ -161,16 +166,20 @@ def test_tcp_leaves_a_gateway_whose_stream_makes_no_sense(port: socket.socket, s
 
 
 @contextmanager
-def websocket_gateway(handler: Callable[[ServerConnection], None], port: int = 0) -> Iterator[Address]:
-    with serve(handler, "127.0.0.1", port, compression=None) as server:
+def websocket_gateway(
+    handler: Callable[[ServerConnection], None], port: int = 0, host: str = "127.0.0.1"
+) -> Iterator[Address]:
+    listening = socket.create_server((host, port), family=family(host))
+    with serve(handler, sock=listening, compression=None) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield Address(*server.socket.getsockname())
+        yield Address(*host_and_port(server.socket.getsockname()))
         server.shutdown()
         thread.join()
 
 
-def test_a_websocket_carries_documents_as_text_and_packets_as_bytes(said: Said) -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_websocket_carries_documents_as_text_and_packets_as_bytes(said: Said, host: str) -> None:
     large = b"x" * 2_000_000
 
     def handler(websocket: ServerConnection) -> None:
@@ -181,7 +190,7 @@ def test_a_websocket_carries_documents_as_text_and_packets_as_bytes(said: Said) 
             pass
 
     with (
-        websocket_gateway(handler) as address,
+        websocket_gateway(handler, host=host) as address,
         closing(WebsocketSource(address, said.append)) as source,
     ):
         assert received(source, 4) == [b'{"op":"x"}', '{"op":"\u00e9"}'.encode(), b"\n\n", large]

@@ -87,6 +87,29 @@ def test_a_table_says_where_to_and_where_its_endpoints_are(
         assert [host for _, host in received(listener, 3)] == ["127.0.6.31", "127.0.6.31", STRANGER[0]]
 
 
+def test_ipv6_senders_are_recorded_and_sent_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One is link-local, and has no such address on this computer."""
+    monkeypatch.chdir(tmp_path)  # where there is no table
+    ours, other = ("::1", free_port("::1")), ("fe80::7%lo", 40002)
+    path = recorded(
+        tmp_path / "it.mcap",
+        seen(imu(1), b"bad", peer=ours),
+        seen(imu(2), b"worse", at=START + MILLISECOND, peer=other),
+    )
+    with closing(Recording(path)) as recording:
+        assert [each.peer for each in recording.datagrams()] == [ours, ours, other, other]
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as listener:
+        listener.bind(("::1", 0))
+        listener.settimeout(5)
+        assert main(["replay", str(path), "--to", place(listener), "--speed", "max"]) == 0
+        arrived = [listener.recvfrom(65536) for _ in range(4)]
+    assert [data for data, _ in arrived] == [imu(1), b"bad", imu(2), b"worse"]
+    assert [address[:2] == ours for _, address in arrived] == [True, True, False, False]
+    assert "does not have the addresses of [fe80::7%lo]:40002 (fe80::7%lo)" in capsys.readouterr().err
+
+
 def test_one_address_for_all_senders(path: Path, receiver: socket.socket) -> None:
     assert main(["replay", str(path), "--to", place(receiver), "--speed", "max", "--from", "127.0.6.77"]) == 0
     assert {host for _, host in received(receiver, 6)} == {"127.0.6.77"}

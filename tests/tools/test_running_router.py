@@ -27,6 +27,7 @@ def test_metrics_are_asked_for_at_the_router_and_no_proxy(monkeypatch: pytest.Mo
         "a:port",
         "http://a b:1",
         "http://[::1",
+        "http://[fd00::zz]:9108",
         "http://rover..local",
         f"http://{'a' * 64}:9108",
     ],

@@ -17,14 +17,24 @@ from rich.table import Table
 
 from router.datagrams import Wire
 from router.errors import UsageError
+from router.hosts import LOOPBACK, loopback_of
 from router.table import read_table
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
 from router.tools.links import Device
 from router.tools.sim_view import SimView
-from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_obedience, parse_silence, streams
-from router.tools.udp import LOOPBACK, open_udp, reachable
+from router.tools.simulator import (
+    STRANGER,
+    Silence,
+    Simulator,
+    Statistics,
+    Stream,
+    parse_obedience,
+    parse_silence,
+    streams,
+)
+from router.tools.udp import open_udp, reachable
 from router.types.table_envelopes import Envelopes
 from tests.compiler.payloads import wire_of
 from tests.ports import free_port
@@ -85,6 +95,53 @@ def test_an_endpoint_sends_to_the_listener_that_believes_it(wire: Wire, table_pa
     with radio, played(wire, read_table(path)) as (simulator, _):
         simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
         assert received(radio, wire) == {"127.0.6.10": {"plain"}}
+
+
+def test_endpoints_of_both_kinds_of_address_send_to_a_listener_of_their_kind(
+    wire: Wire, table_path: Callable[..., Path]
+) -> None:
+    """The board's address is an IPv6 one, the station's an IPv4 one."""
+    path, port, board = table_path(), free_port("::1"), free_port("::1")
+    text = re.sub(r"127\.0\.6\.30:\d+", f'"[::1]:{board}", source_port: {board}', path.read_text())
+    path.write_text(text.replace("endpoints:", f'  six: {{address: "[::1]:{port}"}}\nendpoints:', 1))
+    with (
+        open_udp(Address("::1", port), "six") as six,
+        played(wire, read_table(path)) as (simulator, router),
+        open_udp(Address("::1", 0), "peer") as peer,
+    ):
+        peer.sendto(EMPTY_PLAIN, ("::1", board))
+        found = simulator.statistics
+        simulate(simulator, lambda: len(found.sent) == 2 and bool(found.inboxes["board"].arrivals))
+        assert received(six, wire) == {"::1": {"every_kind"}}
+        assert received(router, wire) == {"127.0.6.10": {"plain"}}
+
+
+@pytest.mark.parametrize("hosts", [["::1"], ["::1", "0.0.0.0"], ["0.0.0.0", "::1"]])
+def test_what_anybody_may_send_goes_to_the_first_listener(
+    wire: Wire, table_path: Callable[..., Path], hosts: list[str]
+) -> None:
+    path, port = table_path(source="any"), free_port("0.0.0.0")
+    listeners = "".join(f"  l{at}: {{address: '{Address(host, port)}'}}\n" for at, host in enumerate(hosts))
+    path.write_text(re.sub(r"  rover: .*\n", listeners, path.read_text()))
+    with (
+        open_udp(Address("::1", port), "six") as six,
+        open_udp(Address("0.0.0.0", port), "four") as four,
+        closing(Simulator(wire, read_table(path), seed=1, speed=FAST)) as simulator,
+    ):
+        simulate(simulator, lambda: bool(simulator.statistics.sent[STRANGER]))
+        first, _ = (six, four) if hosts[0] == "::1" else (four, six)
+        assert received(first, wire)[loopback_of(hosts[0])] == {"every_kind"}
+
+
+def test_an_endpoint_that_is_learned_at_an_ipv6_listener_is_at_its_loopback(
+    wire: Wire, table_path: Callable[..., Path]
+) -> None:
+    path, port = table_path(), free_port("::1")
+    text = re.sub(r"127\.0\.6\.30:\d+, kind: board", "learned, kind: tool, listener: six", path.read_text())
+    path.write_text(text.replace("endpoints:", f'  six: {{address: "[::1]:{port}"}}\nendpoints:', 1))
+    with open_udp(Address("::1", port), "six") as six, played(wire, read_table(path)) as (simulator, _):
+        simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
+        assert received(six, wire) == {"::1": {"every_kind"}}
 
 
 def test_what_comes_back_is_counted_by_endpoint_and_case(wire: Wire, table: RouteTable) -> None:

@@ -17,6 +17,7 @@ from router.datagrams import Wire
 from router.errors import UsageError
 from router.recording.mirror import Mirrored, MirroredDatagram
 from router.table import read_table
+from router.table.addresses import Address
 from router.tools.board import State
 from router.tools.link_end import LinkEnd
 from router.tools.links import board_end, boards_at, router_ends
@@ -69,7 +70,7 @@ def ends(path: Path, role: str) -> Iterator[list[LinkEnd]]:
         yield [opened.enter_context(closing(end)) for end in found]
 
 
-@pytest.mark.parametrize("way", ["connect", "accept"])
+@pytest.mark.parametrize("way", ["connect", "accept", "connect IPv6", "accept IPv6"])
 def test_frames_go_from_one_end_to_the_other_and_connections_begin_again(tcp_path: Tables, way: str) -> None:
     path = tcp_path(way)
     with ends(path, "board") as boards:
@@ -107,6 +108,10 @@ def test_addresses_that_cannot_be_bound_are_told(tcp_path: Tables) -> None:
     path = tcp_path("connect")
     with ends(path, "board"), pytest.raises(UsageError, match=r"'tcp': cannot bind 127.*: another process"):
         boards_of(path)
+    path.write_text(path.read_text().replace('connect: "127.0.0.1', 'connect: "[fe80::1%nowhere0]'))
+    with pytest.raises(UsageError, match=r"cannot bind \[fe80::1%nowhere0\]"):
+        boards_of(path)
+    path.write_text(path.read_text().replace('connect: "[fe80::1%nowhere0]', 'connect: "127.0.0.1'))
     path.write_text(path.read_text().replace('connect: "127.0.0.1', 'connect: "192.0.2.1'))
     program = check_table(path, {}).program
     assert program is not None
@@ -154,7 +159,7 @@ def test_listen_shows_what_the_board_gets(tcp_path: Tables, way: str) -> None:
     assert out.split(" ", 1)[1] == "tcp plain (all default)\n"
 
 
-@pytest.mark.parametrize("way", ["connect", "accept"])
+@pytest.mark.parametrize("way", ["connect", "accept", "accept IPv6"])
 def test_listen_shows_what_all_boards_send(tcp_path: Tables, way: str) -> None:
     path = tcp_path(way)
     with ends(path, "board") as boards:
@@ -169,16 +174,19 @@ def test_listen_shows_what_all_boards_send(tcp_path: Tables, way: str) -> None:
     ]
 
 
-@pytest.mark.parametrize("way", ["connect", "accept"])
+@pytest.mark.parametrize("way", ["connect", "accept", "connect IPv6", "accept IPv6"])
 def test_a_router_and_a_simulated_board_on_one_machine(tmp_path: Path, way: str) -> None:
     """The board sends and obeys, and halts when the commands stop. What the router receives can be sent again."""
-    address = ', address: "127.0.6.30"' if way == "accept" else ""
+    way, _, is_ipv6 = way.partition(" ")
+    host, board = ("::1", "::1") if is_ipv6 else ("127.0.0.1", "127.0.6.30")
+    server = Address(host, free_port(host, socket.SOCK_STREAM))
+    address = f', address: "{board}"' if way == "accept" else ""
     (tmp_path / "table.yaml").write_text(f"""\
 version: 1
 envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
 listen:
   rover: {{address: "127.0.0.1:{free_port()}"}}
-  tcp: {{{way}: "127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}", framing: varint}}
+  tcp: {{{way}: "{server}", framing: varint}}
 endpoints:
   operator: {{address: "127.0.6.10:{free_port("127.0.6.10")}", kind: tool}}
   lander: {{listener: tcp, kind: board{address}}}

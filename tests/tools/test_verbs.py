@@ -21,6 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from router.cli import main
 from router.table import read_table
 from tests.compiler.payloads import wire_of
+from tests.ports import free_port
 from tests.rehearsal.test_tables import TABLES
 from tests.tools.conftest import place
 
@@ -40,6 +41,26 @@ def test_send_says_what_it_sent_once_or_at_a_rate_trimmed_or_padded(
         assert main(["send", "plain", *words, "--to", to, "--protos", str(protos)]) == 0
         assert [receiver.recv(100).hex() for _ in sent] == sent
         assert capsys.readouterr().out.startswith(says)
+
+
+@pytest.mark.parametrize(("form", "sender"), [("127.0.0.1:{}", "127.0.0.1:{}"), ("[0::1]:{}", "[::1]:{}")])
+def test_listen_prints_what_send_sends(protos: Path, form: str, sender: str) -> None:
+    to, origin = free_port("::1"), free_port("::1")
+    command = [sys.executable, "-m", "router", "listen", f"envelope://{form.format(to)}", "--count", "1"]
+    command += ["--protos", str(protos)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
+        assert tap.stdout is not None
+        assert tap.stderr is not None
+        assert tap.stderr.readline() == f"listening on {sender.format(to)}; press Ctrl-C to stop\n"
+        words = ["--to", form.format(to), "--from", form.format(origin), "--protos", str(protos)]
+        assert main(["send", "plain", *words]) == 0
+        assert tap.stdout.read().split(" ", 1)[1] == f"{sender.format(origin)} plain (all default)\n"
+
+
+def test_send_from_another_family_is_refused(protos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--to", "[::1]:9", "--from", "127.0.0.1", "--protos", str(protos)]
+    assert main(["send", "plain", *words]) == 2
+    assert capsys.readouterr().err.endswith("help: give --from an IPv6 address\n")
 
 
 def test_send_fills_fields_beside_the_payload(receiver: socket.socket, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@
 #include <unistd.h>
 
 #include "clock.h"
+#include "hosts.h"
 #include "priority.h"
 #include "route.h"
 #include "threads.h"
@@ -129,7 +130,7 @@ enum outcome { RECEIVED, FOUND_EMPTY, RECEIVE_FAILED };
 
 /* Receive and handle a datagram if there is one. */
 static enum outcome receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
-    struct sockaddr_in sender;
+    union socket_address sender;
     union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct timespec))]; } control;
     struct iovec into = {carrier->routing.datagram, MAX_DATAGRAM + 1};
     struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
@@ -141,7 +142,7 @@ static enum outcome receive_one(struct carrier *carrier, const struct listener *
         return FOUND_EMPTY;
     }
     struct received received = {.listener = listener, .length = (size_t)length, .arrived_at = arrival(listener->fd, &message),
-                                .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
+                                .address = host_number(&sender), .port = host_port(&sender)};
     handle(carrier, &received);
     share_processor(&carrier->share, received.now);
     return RECEIVED;

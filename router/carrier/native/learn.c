@@ -1,6 +1,9 @@
 #include "learn.h"
 
+#include <string.h>
+
 #include "events.h"
+#include "hosts.h"
 #include "report.h"
 
 static uint64_t packed(struct origin origin) { return (uint64_t)origin.address << 16 | origin.port; }
@@ -18,11 +21,19 @@ const struct peer *learned_at(const struct thread_env *env, const struct listene
     return NULL;
 }
 
-/* Whether the settings of the endpoint allow that it sends from there. A sender without a port cannot be answered. */
+static bool is_in(const uint8_t *host, const struct network *network) {
+    uint32_t whole = network->prefix / 8, rest = network->prefix % 8;
+    if (memcmp(host, network->address, whole)) return false;
+    return !rest || !((host[whole] ^ network->address[whole]) >> (8 - rest));
+}
+
+/* Whether the settings of the endpoint allow that it sends from there. A sender without a port cannot be answered, nor one
+ * whose address is not known. */
 static bool is_allowed(const struct learned_peer *learned, struct origin origin) {
-    if (!origin.port || (learned->port && learned->port != origin.port)) return false;
+    uint8_t host[HOST_BYTES];
+    if (!origin.port || (learned->port && learned->port != origin.port) || !host_bytes(origin.address, host)) return false;
     for (uint32_t index = 0; index < learned->network_count; index++)
-        if ((origin.address & learned->networks[index].mask) == learned->networks[index].address) return true;
+        if (is_in(host, &learned->networks[index])) return true;
     return !learned->network_count;
 }
 

@@ -11,6 +11,7 @@
 #include "deadman.h"
 #include "deliver.h"
 #include "envelope.h"
+#include "hosts.h"
 #include "link.h"
 #include "order.h"
 #include "state.h"
@@ -75,7 +76,7 @@ struct protocol {
 
 /* An endpoint, as a listener identifies it. */
 struct peer {
-    uint32_t address; /* host byte order */
+    uint32_t address; /* hosts.h */
     uint32_t port;    /* 0: any */
     uint32_t column;  /* of the listener's choices */
     uint32_t last_seen, heard_since, silences, last_silence; /* counters, the first two of the boot clock */
@@ -85,7 +86,8 @@ struct peer {
 };
 
 struct network {
-    uint32_t address, mask; /* host byte order */
+    uint8_t address[HOST_BYTES];
+    uint32_t prefix; /* bits */
 };
 
 /* An endpoint whose address is learned (learn.h), as a listener identifies it. */

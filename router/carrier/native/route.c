@@ -7,6 +7,7 @@
 #include "each.h"
 #include "evaluate.h"
 #include "events.h"
+#include "hosts.h"
 #include "learn.h"
 
 /* ---- events ---- */
@@ -292,7 +293,7 @@ static __attribute__((noinline)) const struct peer *find_learned(struct routing 
     for (uint32_t index = 0; !known && index < listener->learned_count; index++) {
         const struct learned_peer *learned = &listener->learned[index];
         if (!may_learn(&routing->env, learned, origin, received->now)) continue;
-        if (!is_for_route_of(routing, received, learned->peer.column)) continue;
+        if (!is_for_route_of(routing, received, learned->peer.column) || !host_keep(origin.address)) continue;
         learn(&routing->env, learned, origin);
         known = &learned->peer;
     }

@@ -2,13 +2,17 @@
 
 #include <errno.h>
 #include <limits.h>
-#include <linux/errqueue.h>
+#include <netinet/icmp6.h>
 #include <netinet/ip_icmp.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <time.h>
 
+#include <linux/errqueue.h> /* needs time.h */
+
+#include "hosts.h"
 #include "link.h"
 
 enum { MOST_ERRORS = 32 }; /* read at once */
@@ -16,23 +20,37 @@ enum { MOST_ERRORS = 32 }; /* read at once */
 static pthread_mutex_t list_lock = PTHREAD_MUTEX_INITIALIZER; /* held only briefly */
 static struct sender *first;
 
-_Static_assert(offsetof(struct sockaddr_in, sin_zero) == sizeof(uint64_t), "an address with its port is one word");
+/* An address and port as one word: the first bytes of a struct sockaddr_in. For IPv6 the number of the host is in the place
+ * of its address. */
+struct aim {
+    sa_family_t family;
+    in_port_t port;  /* network byte order */
+    uint32_t number; /* IPv4: network byte order */
+};
 
-static uint64_t packed(const struct sockaddr_in *address) {
+_Static_assert(sizeof(struct aim) == sizeof(uint64_t) && offsetof(struct sockaddr_in, sin_addr) == offsetof(struct aim, number),
+               "an address with its port is one word");
+
+static uint64_t packed(uint32_t number, uint16_t port) {
+    bool is_v6 = host_is_ipv6(number);
+    struct aim aim = {is_v6 ? AF_INET6 : AF_INET, htons(port), is_v6 ? number : htonl(number)};
     uint64_t word;
-    memcpy(&word, address, sizeof word);
+    memcpy(&word, &aim, sizeof word);
     return word;
 }
 
-static struct sockaddr_in unpacked(uint64_t word) {
-    struct sockaddr_in address = {0};
-    memcpy(&address, &word, sizeof word);
-    return address;
+/* Write the address of a word other than 0. Return its size, or 0 if it is not known. */
+static inline socklen_t unpacked(uint64_t word, union socket_address *to) {
+    struct aim aim;
+    memcpy(&aim, &word, sizeof aim);
+    if (aim.family == AF_INET6) return host_address(aim.number, ntohs(aim.port), to);
+    to->v4 = (struct sockaddr_in){0};
+    memcpy(&to->v4, &word, sizeof word);
+    return sizeof to->v4;
 }
 
 void sender_aim(struct sender *sender, uint32_t address, uint16_t port) {
-    struct sockaddr_in to = {.sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(address)};
-    uint64_t word = address ? packed(&to) : 0;
+    uint64_t word = address ? packed(address, port) : 0;
     if (atomic_exchange(&sender->to, word) != word) sender_take_refused(sender);
 }
 
@@ -74,21 +92,22 @@ void sender_close(struct sender *sender) {
 /* Whether the receiver has refused a datagram. Routers also report temporary problems, and this computer reports that ARP is
  * not answered: these say nothing about the next datagram. */
 static bool is_refusal(const struct sock_extended_err *error) {
+    if (error->ee_origin == SO_EE_ORIGIN_ICMP6)
+        return error->ee_type == ICMP6_DST_UNREACH && error->ee_code != ICMP6_DST_UNREACH_NOROUTE &&
+               error->ee_code != ICMP6_DST_UNREACH_ADDR;
     if (error->ee_origin != SO_EE_ORIGIN_ICMP || error->ee_type != ICMP_DEST_UNREACH) return false;
     return error->ee_code != ICMP_NET_UNREACH && error->ee_code != ICMP_HOST_UNREACH;
 }
 
 /* Read an error of a socket. Return whether there was one. `refused` is set to its errno, or 0 if it is not a refusal;
- * `address` is set to that of the datagram, for an IPv4 socket. */
-static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
+ * `address` is set to that of the datagram. */
+static bool read_error(int fd, union socket_address *address, int *refused) {
     union { struct cmsghdr aligned; char bytes[256]; } control;
-    union { struct sockaddr_in v4; struct sockaddr_storage any; } name;
     char byte; /* of the datagram: without a buffer, qemu-user reads nothing but reports success */
     struct iovec into = {&byte, sizeof byte};
-    struct msghdr message = {.msg_name = &name, .msg_namelen = sizeof name, .msg_iov = &into, .msg_iovlen = 1,
+    struct msghdr message = {.msg_name = address, .msg_namelen = sizeof *address, .msg_iov = &into, .msg_iovlen = 1,
                              .msg_control = &control, .msg_controllen = sizeof control};
     if (recvmsg(fd, &message, MSG_ERRQUEUE | MSG_DONTWAIT) < 0) return false;
-    *address = name.v4;
     *refused = 0;
     for (struct cmsghdr *each = CMSG_FIRSTHDR(&message); each; each = CMSG_NXTHDR(&message, each)) {
         bool is_v4 = each->cmsg_level == IPPROTO_IP && each->cmsg_type == IP_RECVERR;
@@ -102,7 +121,12 @@ static bool read_error(int fd, struct sockaddr_in *address, int *refused) {
 
 /* Discard errors, which share the memory of the receive buffer: those of a flood would keep datagrams out. */
 static void discard_errors(int fd) {
-    for (int wanted = 0; wanted <= 1; wanted++) setsockopt(fd, IPPROTO_IP, IP_RECVERR, &wanted, sizeof wanted);
+    int family;
+    socklen_t size = sizeof family;
+    if (getsockopt(fd, SOL_SOCKET, SO_DOMAIN, &family, &size)) return;
+    bool is_v6 = family == AF_INET6;
+    for (int wanted = 0; wanted <= 1; wanted++)
+        setsockopt(fd, is_v6 ? IPPROTO_IPV6 : IPPROTO_IP, is_v6 ? IPV6_RECVERR : IP_RECVERR, &wanted, sizeof wanted);
 }
 
 /* Record an error. Return false if the sender already has one: it keeps one at a time. */
@@ -112,8 +136,8 @@ static bool note(struct sender *sender, int refused) {
 }
 
 /* Record an error for the first sender to the address that has none yet. */
-static void note_by_address(const struct sockaddr_in *address, int refused) {
-    uint64_t to = packed(address);
+static void note_by_address(const union socket_address *address, int refused) {
+    uint64_t to = packed(host_number(address), host_port(address));
     pthread_mutex_lock(&list_lock);
     for (struct sender *each = first; each; each = each->next)
         if (atomic_load_explicit(&each->to, memory_order_relaxed) == to && note(each, refused)) break;
@@ -121,7 +145,7 @@ static void note_by_address(const struct sockaddr_in *address, int refused) {
 }
 
 bool sender_note_errors(int listener) {
-    struct sockaddr_in address;
+    union socket_address address;
     int refused, read = 0;
     for (; read < MOST_ERRORS && read_error(listener, &address, &refused); read++)
         if (refused) note_by_address(&address, refused);
@@ -131,7 +155,7 @@ bool sender_note_errors(int listener) {
 
 /* Like `sender_note_errors`, for errors of the sender's own socket. */
 static bool note_own_errors(struct sender *sender) {
-    struct sockaddr_in address;
+    union socket_address address;
     int fd = atomic_load(&sender->fd), refused, read = 0;
     if (fd == atomic_load(&sender->listener)) return sender_note_errors(fd); /* all senders share it */
     for (; read < MOST_ERRORS && read_error(fd, &address, &refused); read++)
@@ -150,20 +174,23 @@ int sender_take_refused(struct sender *sender) {
 /* Send a datagram. Return 0 or an errno. */
 static int send_once(struct sender *sender, const void *data, size_t size) {
     int fd = atomic_load_explicit(&sender->fd, memory_order_relaxed);
-    struct sockaddr_in to = unpacked(atomic_load_explicit(&sender->to, memory_order_relaxed));
-    if (!to.sin_family) return EDESTADDRREQ;
-    return sendto(fd, data, size, MSG_DONTWAIT, (const struct sockaddr *)&to, sizeof to) < 0 ? errno : 0;
+    uint64_t word = atomic_load_explicit(&sender->to, memory_order_relaxed);
+    union socket_address to;
+    socklen_t length = word ? unpacked(word, &to) : 0;
+    if (!length) return EDESTADDRREQ;
+    return sendto(fd, data, size, MSG_DONTWAIT, &to.any, length) < 0 ? errno : 0;
 }
 
-/* Send from the port of the socket, and from an address that the kernel chooses. Return 0 or an errno. */
+/* Send from the port of the socket, and from an address that the kernel chooses. Return 0 or an errno. For IPv6 this is not
+ * needed: the kernel does not check the address of the socket. */
 static int send_from_any_address(struct sender *sender, const void *data, size_t size) {
     union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct in_pktinfo))]; } control;
     memset(&control, 0, sizeof control); /* no address, no interface */
     control.aligned = (struct cmsghdr){.cmsg_len = CMSG_LEN(sizeof(struct in_pktinfo)), .cmsg_level = IPPROTO_IP,
                                        .cmsg_type = IP_PKTINFO};
     struct iovec from = {(void *)(uintptr_t)data, size};
-    struct sockaddr_in to = unpacked(atomic_load(&sender->to));
-    struct msghdr message = {.msg_name = &to, .msg_namelen = sizeof to, .msg_iov = &from,
+    union socket_address to;
+    struct msghdr message = {.msg_name = &to, .msg_namelen = unpacked(atomic_load(&sender->to), &to), .msg_iov = &from,
                              .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof control};
     return sendmsg(atomic_load(&sender->fd), &message, MSG_DONTWAIT) < 0 ? errno : 0;
 }
@@ -171,7 +198,7 @@ static int send_from_any_address(struct sender *sender, const void *data, size_t
 /* Send through the link instead, if the sender has one: so a datagram through a socket does not pay for links.
  * Retry after an error if it is about an earlier datagram, or if this computer may have lost the socket's address: a brake
  * must then be sent from another one. Return 0 or an errno. */
-static int send_again(struct sender *sender, const void *data, size_t size, int error) {
+static __attribute__((noinline)) int send_again(struct sender *sender, const void *data, size_t size, int error) {
     if (sender->link) return link_send(sender->link, data, size, false);
     if (note_own_errors(sender)) error = send_once(sender, data, size);
     bool may_lack_address = (error == EINVAL || error == ENETUNREACH) && atomic_load(&sender->listener) >= 0;

@@ -2,11 +2,10 @@
  *
  * It is not connected, so that replies reach a listener. It is bound to the address and port of that listener, or to a port
  * chosen by the kernel. ICMP errors about its datagrams reach the listener, or the socket itself if there is no listener or
- * they arrive on another interface than the listener's. */
+ * they arrive on another interface than the listener's; for IPv6, the latter are lost. */
 #ifndef SENDER_H
 #define SENDER_H
 
-#include <netinet/in.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -17,13 +16,13 @@ struct link;
 struct sender {
     struct sender *next; /* in the list of all senders */
     struct link *link;   /* NULL for a socket. A link has no address, so sending to that fails first */
-    _Atomic uint64_t to;  /* the bytes of its struct sockaddr_in without the padding; 0 while it has no address */
+    _Atomic uint64_t to;  /* its address and port; 0 while it has no address */
     _Atomic int fd;       /* -1 after `sender_end` */
     _Atomic int listener; /* the socket of the listener from whose port it sends; -1 for none */
     _Atomic int refused;  /* errno about an earlier datagram, not returned yet; 0 for none */
 };
 
-/* Open a sender to `address` (host byte order) and `port`; to 0 and 0 while it has no address, and sending fails with
+/* Open a sender to `address` (hosts.h) and `port`; to 0 and 0 while it has no address, and sending fails with
  * EDESTADDRREQ. Returns NULL if memory runs out. The caller closes the sockets after `sender_end`, after which sending fails
  * with EBADF. */
 struct sender *sender_open(int fd, int listener, uint32_t address, uint16_t port);

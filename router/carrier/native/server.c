@@ -1,8 +1,6 @@
 #include "server.h"
 
-#include <arpa/inet.h>
 #include <errno.h>
-#include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
 #include <stdatomic.h>
@@ -15,12 +13,13 @@
 #include "deliver.h"
 #include "envelope.h"
 #include "events.h"
+#include "hosts.h"
 #include "link.h"
 #include "priority.h"
 #include "tcp.h"
 #include "threads.h"
 
-enum { AGAIN_MS = 1000 /* from one attempt to listen to the next */ };
+enum { AGAIN_MS = 1000 /* from one attempt to listen, or look at the network interface, to the next */ };
 
 struct server {
     struct timers *timers;
@@ -32,10 +31,10 @@ struct server {
     struct client *first;  /* the newest */
 };
 
-static void report_stranger(struct server *server, const struct sockaddr_in *from) {
+static void report_stranger(struct server *server, const union socket_address *from) {
     struct thread_env *env = server->timers->env;
     struct datagram_event event = {.kind = EVENT_REJECTED, .listener = server->listener, .reason = SOURCE_MISMATCH,
-                                   .address = ntohl(from->sin_addr.s_addr), .port = ntohs(from->sin_port),
+                                   .address = host_number(from), .port = host_port(from),
                                    .counter = server->refused};
     pthread_mutex_lock(&server->timers->lock);
     env_count(env, server->refused, 1);
@@ -43,10 +42,11 @@ static void report_stranger(struct server *server, const struct sockaddr_in *fro
     pthread_mutex_unlock(&server->timers->lock);
 }
 
-static void welcome(struct server *server, int fd, const struct sockaddr_in *from) {
+static void welcome(struct server *server, int fd, const union socket_address *from) {
     pthread_mutex_lock(&server->lock);
+    uint32_t host = host_number(from); /* a reload may know another address of this number before it joins */
     struct client *client = server->first;
-    while (client && client->host != ntohl(from->sin_addr.s_addr)) client = client->next;
+    while (client && client->host != host) client = client->next;
     if (client) link_offer(client->link, fd);
     pthread_mutex_unlock(&server->lock);
     if (client) return;
@@ -54,31 +54,40 @@ static void welcome(struct server *server, int fd, const struct sockaddr_in *fro
     report_stranger(server, from);
 }
 
-static void fail(struct server *server, int why) {
+/* Report why the clients are not connected. */
+static void report(struct server *server, int why) {
     pthread_mutex_lock(&server->lock);
     for (struct client *client = server->first; client; client = client->next) link_fail(client->link, why);
     pthread_mutex_unlock(&server->lock);
 }
 
-/* Wait until there is a connection, or the server is to stop, or for some time (ms; -1: no limit). */
-static void await(struct server *server, int fd, int timeout) {
+/* Wait until there is a connection, or the server is to stop, or for some time. */
+static void await(struct server *server, int fd) {
     struct pollfd waiting[] = {{server->wake, POLLIN, 0}, {fd, POLLIN, 0}};
-    poll(waiting, 2, timeout);
+    poll(waiting, 2, AGAIN_MS);
+}
+
+/* Return the descriptor, or another one if it is not at the present network interface. */
+static int listen_again(struct server *server, int fd) {
+    if (fd >= 0 && tcp_is_at(fd, server->host)) return fd;
+    if (fd >= 0) close(fd);
+    fd = tcp_listen(server->host, server->port);
+    report(server, fd < 0 ? -fd : ENOTCONN);
+    return fd;
 }
 
 static void *server_thread(void *of) {
     struct server *server = of;
     int fd = -1;
     while (!atomic_load(&server->is_stopping)) {
-        if (fd < 0) fd = tcp_listen(server->host, server->port);
-        if (fd < 0) fail(server, -fd);
-        await(server, fd, fd < 0 ? AGAIN_MS : -1);
+        fd = listen_again(server, fd);
+        await(server, fd);
         if (fd < 0) continue;
-        struct sockaddr_in from;
+        union socket_address from;
         socklen_t size = sizeof from;
-        int accepted = accept4(fd, (struct sockaddr *)&from, &size, SOCK_NONBLOCK | SOCK_CLOEXEC);
+        int accepted = accept4(fd, &from.any, &size, SOCK_NONBLOCK | SOCK_CLOEXEC);
         if (accepted >= 0) welcome(server, accepted, &from);
-        else if (errno != EAGAIN && errno != ECONNABORTED) await(server, -1, AGAIN_MS); /* no descriptors */
+        else if (errno != EAGAIN && errno != ECONNABORTED) await(server, -1); /* no descriptors */
     }
     if (fd >= 0) close(fd);
     return NULL;

@@ -3,22 +3,28 @@
 #include <errno.h>
 #include <linux/sockios.h>
 #include <linux/tcp.h> /* struct tcp_info of <netinet/tcp.h> is older */
-#include <netinet/in.h>
 #include <poll.h>
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
-enum { CONNECTING_MS = 1000, PROBE_AFTER = 1 /* s */, WAITING_CLIENTS = 16 };
+#include "hosts.h"
+
+enum { CONNECTING_MS = 1000, PROBE_AFTER = 1 /* s */, WAITING_CLIENTS = 128 };
 
 static void set(int fd, int level, int option, int value) { setsockopt(fd, level, option, &value, sizeof value); }
 
-static struct sockaddr_in address_of(uint32_t host, uint32_t port) {
-    return (struct sockaddr_in){
-        .sin_family = AF_INET, .sin_addr.s_addr = htonl(host), .sin_port = htons((uint16_t)port)};
+/* Write the address, and open a socket of its family. Return a negative errno on failure. */
+static int tcp_socket(uint32_t host, uint32_t port, union socket_address *address, socklen_t *size) {
+    *size = host_address(host, (uint16_t)port, address);
+    if (!*size) return -EADDRNOTAVAIL;
+    bool is_v6 = address->any.sa_family == AF_INET6;
+    if (is_v6 && IN6_IS_ADDR_LINKLOCAL(&address->v6.sin6_addr) && !address->v6.sin6_scope_id) return -ENONET;
+    int fd = socket(address->any.sa_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+    if (fd < 0) return -errno;
+    if (is_v6) set(fd, IPPROTO_IPV6, IPV6_V6ONLY, 1);
+    return fd;
 }
-
-static int tcp_socket(void) { return socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0); }
 
 /* Return 0, or the errno of an attempt to connect. */
 static int await_connection(int fd, int wake) {
@@ -31,11 +37,12 @@ static int await_connection(int fd, int wake) {
 }
 
 int tcp_connect(uint32_t host, uint32_t port, uint32_t patience, int wake) {
-    struct sockaddr_in to = address_of(host, port);
-    int fd = tcp_socket();
-    if (fd < 0) return -errno;
+    union socket_address to;
+    socklen_t size;
+    int fd = tcp_socket(host, port, &to, &size);
+    if (fd < 0) return fd;
     tcp_settle(fd, patience);
-    int error = connect(fd, (struct sockaddr *)&to, sizeof to) ? errno : 0;
+    int error = connect(fd, &to.any, size) ? errno : 0;
     if (error == EINPROGRESS) error = await_connection(fd, wake);
     if (!error) return fd;
     close(fd);
@@ -43,14 +50,22 @@ int tcp_connect(uint32_t host, uint32_t port, uint32_t patience, int wake) {
 }
 
 int tcp_listen(uint32_t host, uint32_t port) {
-    struct sockaddr_in at = address_of(host, port);
-    int fd = tcp_socket();
-    if (fd < 0) return -errno;
+    union socket_address at;
+    socklen_t size;
+    int fd = tcp_socket(host, port, &at, &size);
+    if (fd < 0) return fd;
     set(fd, SOL_SOCKET, SO_REUSEADDR, 1); /* connections of an earlier router may still be closing */
-    if (!bind(fd, (struct sockaddr *)&at, sizeof at) && !listen(fd, WAITING_CLIENTS)) return fd;
+    if (!bind(fd, &at.any, size) && !listen(fd, WAITING_CLIENTS)) return fd;
     int error = errno;
     close(fd);
     return -error;
+}
+
+bool tcp_is_at(int fd, uint32_t host) {
+    union socket_address bound, now;
+    socklen_t size = sizeof bound;
+    if (getsockname(fd, &bound.any, &size) || !host_address(host, 0, &now) || now.any.sa_family != AF_INET6) return true;
+    return bound.v6.sin6_scope_id == now.v6.sin6_scope_id;
 }
 
 void tcp_settle(int fd, uint32_t patience) {

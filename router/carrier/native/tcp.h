@@ -9,8 +9,13 @@
  * block, or a negative errno. */
 int tcp_connect(uint32_t host, uint32_t port, uint32_t patience, int wake);
 
-/* Listen at an address. Return a descriptor that does not block, or a negative errno. */
+/* Listen at an address. Return a descriptor that does not block, or a negative errno: ENONET if the network interface of a
+ * link-local address is missing. */
 int tcp_listen(uint32_t host, uint32_t port);
+
+/* Whether a socket that listens at an address is bound to its present network interface. One that was removed and has come
+ * back is another one. */
+bool tcp_is_at(int fd, uint32_t host);
 
 /* Send each frame at once, and look after a second of silence whether the other end is still there. Also while this process
  * does not run, the kernel ends the connection if sent bytes are not acknowledged, `patience` (ms) after it has sent them again,

@@ -11,11 +11,15 @@ from contextlib import suppress
 from router.errors import StartError
 from router.gateway.transport.base import report_fault
 from router.log import logger
+from router.net.addresses import open_socket, socket_address
 from router.net.kernel import why_not_bound
 from router.table.addresses import Address
 
 RETRY_SECONDS = 1.0
 """The interval of attempts to open an address that this machine does not have."""
+
+_ABSENT = (errno.EADDRNOTAVAIL, errno.ENODEV)
+"""Errors of binding to an address that this machine does not have, or to one of a missing network interface."""
 
 MOST_UNACCEPTED = 1024
 """The listen backlog: this many clients can connect at once."""
@@ -38,7 +42,7 @@ class Binding:
         try:
             await self._attempt()
         except OSError as error:
-            if error.errno != errno.EADDRNOTAVAIL:
+            if error.errno not in _ABSENT:
                 raise self._refusal(error) from error
             logger.warning("no network interface has this address yet; waiting for it", address=str(self._address))
             self._retrying = asyncio.get_running_loop().create_task(self._retry())
@@ -50,13 +54,13 @@ class Binding:
                 await self._retrying
 
     async def _retry(self) -> None:
-        reported = errno.EADDRNOTAVAIL
+        reported = None
         while True:
             await asyncio.sleep(RETRY_SECONDS)
             try:
                 await self._attempt()
             except OSError as error:
-                if error.errno not in (None, errno.EADDRNOTAVAIL, reported):
+                if error.errno not in (None, *_ABSENT, reported):
                     reported = error.errno
                     logger.error("cannot bind to the address; retrying", why=str(self._refusal(error)))
             except Exception as error:  # noqa: BLE001 - a fault of the router is reported; retry
@@ -72,13 +76,13 @@ class Binding:
 
 def listen_at(address: Address) -> socket.socket:
     """Return a non-blocking TCP socket that listens on `address`. Raises OSError."""
-    opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    opened = open_socket(address.host, socket.SOCK_STREAM)
     try:
         # Lets a restarted router bind while old connections end; a port with another listener is still refused.
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         opened.setblocking(False)
-        opened.bind(address)
+        opened.bind(socket_address(*address))
         opened.listen(MOST_UNACCEPTED)
     except OSError:
         opened.close()

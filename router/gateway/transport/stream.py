@@ -15,7 +15,9 @@ from typing import Any, NamedTuple, Union
 from router.gateway.transport.arrival import LoopClock
 from router.gateway.transport.base import LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
+from router.hosts import bracketed
 from router.log import FloodLog, logger
+from router.net.addresses import bound_address
 from router.net.doors import Door
 from router.table.addresses import Address
 
@@ -121,7 +123,7 @@ class StreamClient:
         peer = peer or ("a client that has left", 0)
         self.host: str = peer[0]
         self.own_host: str = (connection.get_extra_info("sockname") or ("", 0))[0]
-        self.label = f"{self.host}:{peer[1]}"
+        self.label = f"{bracketed(self.host)}:{peer[1]}"
         self.unfinished_since: float | None = None
         self._owner = owner
         self._connection = connection
@@ -251,7 +253,7 @@ class StreamTransport(ABC):
             listening.close()
             raise
         listening.listen(MOST_UNACCEPTED)
-        self.address = Address(*listening.getsockname())
+        self.address = Address(*bound_address(listening))
 
     def admits(self, client: StreamClient) -> bool:
         """Return whether the client is in a network that may connect; otherwise count and log it."""

@@ -13,7 +13,10 @@ from contextlib import suppress
 
 from router.gateway.transport.base import LOW_WATER, PER_TURN, Client, Events, Frame
 from router.gateway.transport.binding import Binding
+from router.hosts import any_of, zone
+from router.net.addresses import bound_address, interface_index, socket_address
 from router.net.kernel import allow_fragments, arrivals, ask_for_receive_buffer, drops
+from router.net.sockets import open_udp
 from router.table.addresses import Address
 from router.table.units import LARGEST_DATAGRAM
 
@@ -35,9 +38,10 @@ class UdpTransport:
     def __init__(self, remote: Address, local: Address | None, events: Events) -> None:
         self.address: Address | None = None
         self._remote = remote
+        self._host, _, self._zone = remote.host.partition("%")
         self._local = local
         self._events = events
-        self._binding = Binding("udp", local or Address("0.0.0.0", 0), self._bind)
+        self._binding = Binding("udp", local or Address(any_of(remote.host), 0), self._bind)
         self._client: UdpClient | None = None
         self._socket: socket.socket | None = None
         self._drops_at_close = 0
@@ -68,11 +72,11 @@ class UdpTransport:
             client.write(frames)
 
     async def _bind(self) -> None:
-        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened = open_udp(self._remote.host)
         opened.setblocking(False)
         try:
             # Never SO_REUSEADDR: with it, a second router would steal the port unnoticed.
-            opened.bind(self._local or ("", 0))
+            opened.bind(socket_address(*self._local or (any_of(self._remote.host), 0)))
             allow_fragments(opened)
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
             if self._local is not None:
@@ -82,7 +86,7 @@ class UdpTransport:
             opened.close()
             raise
         self._socket = opened
-        self.address = Address(*opened.getsockname())
+        self.address = Address(*bound_address(opened))
         self._client = UdpClient(opened, self._remote, self._events)
         if self._local is not None:
             asyncio.get_running_loop().add_reader(opened, self._receive, opened, self._client)
@@ -97,7 +101,7 @@ class UdpTransport:
             except OSError as error:
                 self._events.failed(client, error, 0)
                 return
-            if sender[0] != self._remote.host:
+            if sender[0] != self._host or (self._zone and sender[3] != interface_index(self._zone)):
                 self._events.refused("source_mismatch")
             else:
                 self._events.received(client, data, self._arrived_at())
@@ -110,6 +114,7 @@ class UdpClient:
         self.label = str(remote)
         self._send = opened.sendto
         self._remote = remote
+        self._to = None if zone(remote.host) else socket_address(*remote)
         self._events = events
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[bytes] = deque()
@@ -156,7 +161,7 @@ class UdpClient:
             self._burst += 1
             self._burst_bytes += len(data)
             try:
-                self._send(data, self._remote)
+                self._send(data, self._to or socket_address(*self._remote))
             except OSError as error:
                 failure, lost = error, lost + 1
                 if isinstance(error, BlockingIOError):  # the network is slower than this burst

@@ -128,6 +128,7 @@ _KEYS: Schema = {
         "is sent to it.",
         {"type": "array", "minItems": 1, "items": ref("network")},
         ["127.0.0.0/8"],
+        ["127.0.0.0/8", "::1/128"],
     ),
     "defaults": ref("defaults"),
     "listen": key(

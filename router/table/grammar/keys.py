@@ -17,13 +17,13 @@ import inspect
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from ipaddress import IPv4Network
 from itertools import pairwise
 from typing import Any
 
 import yaml
 
 from router.errors import SourceSpan
+from router.table.addresses import IPNetwork
 from router.table.keys import Key, Listed, OneOf, Range, Shape, keys_of
 from router.table.model.expressions import Expression, FieldMap
 from router.table.model.gateways import GatewayFormat, InboundDeadman, TopicRate
@@ -44,10 +44,10 @@ _INLINE: Mapping[object, Schema] = {
     "at_start": {"type": "string", "enum": ["send", "silent"]},
     "reason": REASON,
 }
-_DEFINED: Mapping[type, str] = {
+_DEFINED: Mapping[object, str] = {
     Expression: "part_expression",
     FieldMap: "fields",
-    IPv4Network: "network",
+    IPNetwork: "network",
     Payload: "payloads",
     TopicRate: "topic_rates",
 }
@@ -188,9 +188,11 @@ def _item(key: Key) -> Schema:
         return _INLINE[kind]
     if isinstance(kind, str):
         return ref(kind)
+    if kind in _DEFINED:
+        return ref(_DEFINED[kind])
     if issubclass(kind, enum.Enum):
         return {"type": "string", "enum": [word.value for word in kind]}
-    return ref(_DEFINED.get(kind) or _words(kind))
+    return ref(_words(kind))
 
 
 def _default(key: Key) -> Schema:

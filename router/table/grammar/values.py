@@ -18,6 +18,10 @@ and editors show another key's title.
 _OCTET = "(?:25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _HOST = rf"(?:{_OCTET}\.){{3}}{_OCTET}"
 _GROUP = rf"(?:22[4-9]|23[0-9])(?:\.{_OCTET}){{3}}"
+_INTERFACE = r"(?!\.{1,2}$)[A-Za-z0-9_.-]{1,15}"
+_IPV6 = "[0-9A-Fa-f]*(?::[0-9A-Fa-f]*){2,8}(?:[0-9]+(?:\\.[0-9]+){3})?"
+"""An IPv6 address, and some text that is none: that is left to the parser."""
+_LOCAL_IPV6 = rf"{_IPV6}(?:%[A-Za-z0-9_.-]{{1,15}})?"
 _LABEL = "[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _PORT = "(?:[1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
@@ -68,10 +72,13 @@ def _text_or(otherwise: Schema) -> Schema:
 
 VALUES: Schema = {
     "variable": {"type": "string", "pattern": _VARIABLE},
-    "address": _text(f"^{_HOST}:{_PORT}$", "be an IPv4 address and a port, such as '192.168.0.30:8'"),
+    "address": _text(
+        rf"^(?:{_HOST}|\[{_LOCAL_IPV6}\]):{_PORT}$",
+        "be an IP address and a port, such as '192.168.0.30:8' or '[fd00::30]:8'",
+    ),
     "endpoint_address": _text(
-        rf"^(?:(?:{_HOST}|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}|{_HOST}|learned)$",
-        "be an IPv4 address or a host name, and a port, such as '192.168.0.30:8', or 'learned'",
+        rf"^(?:(?:{_HOST}|\[{_LOCAL_IPV6}\]|(?:{_LABEL}\.)*(?=[A-Za-z]){_LABEL}):{_PORT}|{_HOST}|{_LOCAL_IPV6}|learned)$",
+        "be an IP address or a host name, and a port, such as '192.168.0.30:8' or '[fd00::30]:8', or 'learned'",
     ),
     "device": _text(r"^/\S+$", "be the path of a device, such as '/dev/serial/by-id/usb-board-if00'"),
     "stream_framing": {
@@ -98,11 +105,15 @@ VALUES: Schema = {
             minProperties=1, maxProperties=1,
         )),
     },
-    "network": _text(f"^{_HOST}/(?:3[0-2]|[12]?[0-9])$", "be an IPv4 network, such as '127.0.0.0/8'"),
-    "group": _text(
-        f"^{_GROUP}$", "be a multicast group, from 224.0.0.0 to 239.255.255.255, such as '224.5.23.2'"
+    "network": _text(
+        f"^(?:{_HOST}/(?:3[0-2]|[12]?[0-9])|{_IPV6}/(?:1[01][0-9]|12[0-8]|[1-9]?[0-9]))$",
+        "be a network, such as '127.0.0.0/8' or 'fd00::/8'",
     ),
-    "interface": _text(r"^(?!\.{1,2}$)[A-Za-z0-9_.-]{1,15}$", "be the name of a network interface, such as 'wlan0'"),
+    "group": _text(
+        f"^(?:{_GROUP}|[Ff]{{2}}{_IPV6})$",
+        "be a multicast group, from 224.0.0.0 to 239.255.255.255 or in ff00::/8, such as '224.5.23.2'",
+    ),
+    "interface": _text(f"^{_INTERFACE}$", "be the name of a network interface, such as 'wlan0'"),
     "path": {
         **TEXT,
         "pattern": r"^(?!~(?:/|$))(?!.*\$\(?[A-Za-z_])",

@@ -9,10 +9,10 @@ Annotations are evaluated in all these modules: as strings, they would be compil
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from ipaddress import IPv4Network
 from pathlib import Path
 
 from router.errors import Located, SourceSpan
+from router.table.addresses import IPNetwork
 from router.table.model.endpoints import Endpoint, Listener
 from router.table.model.gateways import Gateway, IgnoredGateway
 from router.table.model.routes import Route
@@ -27,7 +27,7 @@ class Networks:
     """The networks that contain every address of the table. `span` is the key `networks`."""
 
     span: SourceSpan
-    members: tuple[IPv4Network, ...]
+    members: tuple[IPNetwork, ...]
 
     def __str__(self) -> str:
         """Return the text for findings, with the position of the key."""

@@ -2,11 +2,10 @@
 
 import enum
 from dataclasses import dataclass, field
-from ipaddress import IPv4Network
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
-from router.table.addresses import BROADCAST, ENDPOINT, GROUP, LOCAL, Address
+from router.table.addresses import BROADCAST, ENDPOINT, GROUP, JOINED, LOCAL, Address, IPNetwork
 from router.table.keys import SOME, Listed, Named, Range, Shape
 from router.table.model.expressions import FieldMap
 from router.table.model.serial import SerialLine
@@ -41,10 +40,12 @@ class Listener:
     name: str
     span: SourceSpan
     address: Annotated[Located[Address], LOCAL]
-    """The local address to bind; 0.0.0.0 is every network of this computer.
+    """The local address to bind; 0.0.0.0 is every network of this computer. A listener receives either IPv4 or IPv6
+    datagrams: [::] is every network for IPv6.
 
     Title: Listener address
     Example: 0.0.0.0:5000
+    Example: "[::]:5000"
     """
     framing: Framing = Framing.ZERO_TRIMMED
     """zero_trimmed: senders may remove trailing zero bytes or pad with them; the router undoes both before it forwards.
@@ -61,11 +62,13 @@ class Listener:
     Example: wlan0
     Example: wg0
     """
-    groups: Annotated[tuple[Located[str], ...], Shape("group"), Listed(least=1, unique=True)] = ()
+    groups: Annotated[tuple[Located[str], ...], JOINED, Listed(least=1, unique=True)] = ()
     """Also receive datagrams to these multicast groups, on `interface`; without it, on the interface to which the
-    computer's routes send the group. The address must be at 0.0.0.0; its port is shared with other programs.
+    computer's routes send the group. The address must be at 0.0.0.0, or [::] for IPv6 groups; its port is shared with
+    other programs.
 
     Example: [224.5.23.2]
+    Example: ["ff02::4:1"]
     """
     link: SerialLine | TcpClient | TcpServer | None = None
     envelope: Located[str] | None = None
@@ -118,10 +121,11 @@ class Endpoint:
 
     Title: Endpoint address
     Example: 192.168.0.30:8
+    Example: "[fd00::30]:8"
     Example: robot3.local:50052
     Example: learned
     """
-    networks: Annotated[tuple[IPv4Network, ...], SOME] = ()
+    networks: Annotated[tuple[IPNetwork, ...], SOME] = ()
     """Learn the address only in these networks. Default: the `networks` of the table, or else any.
 
     Title: Networks to learn in
@@ -171,7 +175,7 @@ class Endpoint:
     send_from: Located[str] | None = None
     """Send datagrams to it from this listener's address and port, so that replies reach that listener. ephemeral: from
     a port that the kernel chooses, so replies are lost. Default: the endpoint's listener; without one, the address and
-    port of all listeners if they are the same, else ephemeral.
+    port of all listeners of its kind of IP address if they are the same, else ephemeral. IPv6 groups: always ephemeral.
 
     Example: rover
     Example: ephemeral

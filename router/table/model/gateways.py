@@ -3,12 +3,11 @@
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
-from router.table.addresses import LOCAL, Address
+from router.table.addresses import LOCAL, Address, IPNetwork
 from router.table.keys import SOME, Named, OneOf, Range, Shape, Words
 from router.table.model.expressions import FieldMap
 from router.table.model.routes import DeadmanKeys
@@ -299,7 +298,7 @@ class Gateway:
 
     Title: Most clients per host
     """
-    networks: Annotated[tuple[IPv4Network, ...], Named("from"), SOME] = ()
+    networks: Annotated[tuple[IPNetwork, ...], Named("from"), SOME] = ()
     """Only clients in these networks may connect over tcp or websocket, as for `http`.
 
     Title: Clients' networks

@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Annotated
 
 from router.errors import Located, SourceSpan
-from router.table.addresses import LOCAL, Address
+from router.table.addresses import LOCAL, Address, IPNetwork
 from router.table.keys import SOME, Named, Shape
 from router.table.units import DISK_SIZE, DURATION
 
@@ -135,7 +134,7 @@ class ServerSettings:
     span: SourceSpan
     address: Annotated[Located[Address], LOCAL]
     """The local TCP address that clients connect to."""
-    networks: Annotated[tuple[IPv4Network, ...], Named("from"), SOME] = ()
+    networks: Annotated[tuple[IPNetwork, ...], Named("from"), SOME] = ()
     """Only clients in these networks may connect, and always those on the router's own computer, which include all
     clients of a proxy there. Others are refused, counted and logged. Without this key anybody may connect.
 

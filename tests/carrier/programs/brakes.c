@@ -1,5 +1,6 @@
 /* Threads that send commands, brake, and replace deadmen at once. Fails if a command arrives behind a brake although it
  * had expired when the brake was due; sanitizers see the rest. The argument is how many commands each thread sends. */
+#include <netinet/in.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
