@@ -87,6 +87,7 @@ def test_until_its_name_is_resolved_nothing_is_sent_to_an_endpoint_or_accepted_f
         wait_until(lambda: of(router, "messages_dropped", "manual_drive", "robot", "send_error") == 1, "the loss")
         robot.sendto(numbered(1), ("127.0.0.1", site.listen))
         wait_until(lambda: of(router, "datagrams_rejected", "rover", "source_mismatch") == 1, "the rejection")
+        wait_until(lambda: len(resolver.asked) > (not hangs), "an attempt that hangs, or one that has failed")
         resolver.found = [ROBOT]
         resolver.answers.set()
         wait_until(lambda: is_unresolved(router) == 0, "the address")
