@@ -50,6 +50,10 @@ def bracketed(host: str) -> str:
     return f"[{host}]" if is_ipv6(host) else host
 
 
+def with_port(host: str, port: int) -> str:
+    return f"{bracketed(host)}:{port}"
+
+
 def packed(host: str) -> bytes:
     """Return the bytes of an IP address, without a zone."""
     if not is_ipv6(host):

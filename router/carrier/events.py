@@ -28,7 +28,7 @@ from router.declared import (
     StateContent,
     StateEvent,
 )
-from router.hosts import bracketed
+from router.hosts import with_port
 from router.image.names import Names
 from router.net.addresses import host_text, origin_text
 from router.threads import Thread, join_or_abandon
@@ -170,7 +170,7 @@ class EventReader:
         event, begin = DatagramEvent.from_buffer(record), ctypes.sizeof(DatagramEvent)
         listener, data = self._name(event.listener), bytes(record[begin : begin + event.length])
         host = host_text(event.address)
-        place = f"{bracketed(host)}:{event.port}" if event.port else host
+        place = with_port(host, event.port) if event.port else host
         sender = f"from {place}" if event.address else "from the serial line"
         if event.kind == EventKind.SUPERSEDED:
             detail = f"{sender}: {self._superseded(listener, data)}"

@@ -8,7 +8,7 @@ from ipaddress import ip_address
 
 from router.compiler.compiled_table import CompiledTable
 from router.compiler.network import fitting, networks_of, reaches, sent_by
-from router.hosts import bracketed, host_number, is_ipv6
+from router.hosts import host_number, is_ipv6, with_port
 from router.table.addresses import Address, BadAddressError, parse_remote
 from router.table.model import RouteTable
 from router.table.model.endpoints import Endpoint
@@ -82,7 +82,7 @@ def why_unusable(program: CompiledTable, name: str, host: str) -> str:
         if address.host != name:
             continue
         try:
-            found = parse_remote(f"{bracketed(host)}:{address.port}")
+            found = parse_remote(with_port(host, address.port))
         except BadAddressError as error:
             return error.what
         if found.is_ipv6 not in fitting(table, endpoint):

@@ -8,7 +8,7 @@ import socket
 import struct
 from functools import cache
 
-from router.hosts import FIRST_IPV6, LAST_IPV6, bracketed, host_number, is_ipv6, packed, zone
+from router.hosts import FIRST_IPV6, LAST_IPV6, host_number, is_ipv6, packed, with_port, zone
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -36,6 +36,12 @@ def interface_index(name: str) -> int | None:
         return None
 
 
+def _zone_index(host: str) -> int | None:
+    """Return the index of the interface in an IPv6 address, 0 without one; None if there is no such interface."""
+    name = zone(host)
+    return interface_index(name) if name else 0
+
+
 def socket_address(host: str, port: int) -> tuple[str, int] | tuple[str, int, int, int]:
     """Return an address for the socket module, which ignores the zone in a host.
 
@@ -43,8 +49,7 @@ def socket_address(host: str, port: int) -> tuple[str, int] | tuple[str, int, in
     """
     if not is_ipv6(host):
         return host, port
-    name = zone(host)
-    index = interface_index(name) if name else 0
+    index = _zone_index(host)
     if index is None:
         raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
     return host.partition("%")[0], port, 0, index
@@ -75,18 +80,12 @@ def addresses_of(host: str) -> list[str]:
     return sorted((host_and_port(address)[0] for *_, address in found), key=is_ipv6)
 
 
-def _present_index(host: str) -> int:
-    """Return the index of the interface of an IPv6 address, 0 without one."""
-    name = zone(host)
-    return (interface_index(name) or 0) if name else 0
-
-
 def seen(library: ctypes.CDLL, host: str) -> int:
     """Return the number that a sender at an address has: that of a stranger if it is another address's."""
     if not is_ipv6(host):
         return host_number(host)
-    address = struct.pack("=HHI16sI", socket.AF_INET6, 0, 0, packed(host), _present_index(host))  # struct sockaddr_in6
-    return int(library.host_number_ipv6(address))
+    sockaddr_in6 = struct.pack("=HHI16sI", socket.AF_INET6, 0, 0, packed(host), _zone_index(host) or 0)
+    return int(library.host_number_ipv6(sockaddr_in6))
 
 
 def know(library: ctypes.CDLL, host: str) -> int:
@@ -94,7 +93,7 @@ def know(library: ctypes.CDLL, host: str) -> int:
 
     Raises MemoryError.
     """
-    if is_ipv6(host) and not library.host_add(packed(host), _present_index(host)):
+    if is_ipv6(host) and not library.host_add(packed(host), _zone_index(host) or 0):
         raise MemoryError(f"there is no number left for the address {host}: restart the router")
     return host_number(host)
 
@@ -120,4 +119,4 @@ def host_text(number: int) -> str:
 
 def origin_text(origin: int) -> str:
     """Return an address and port, as native code packs them, as text."""
-    return f"{bracketed(host_text(origin >> 16))}:{origin & 0xFFFF}"
+    return with_port(host_text(origin >> 16), origin & 0xFFFF)

@@ -13,8 +13,9 @@ from contextlib import suppress
 from functools import cache
 
 from router.clock import wall_ns
-from router.hosts import bracketed
+from router.hosts import with_port
 from router.log import logger
+from router.net.addresses import bound_address
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def discard_unstamped(opened: socket.socket) -> None:
     if count:
         logger.warning(
             "datagrams of unknown age waited in an inherited socket and were discarded",
-            address=f"{bracketed(opened.getsockname()[0])}:{opened.getsockname()[1]}",
+            address=with_port(*bound_address(opened)),
             datagrams=count,
             remedy="write Timestamping=ns in its socket unit",
         )

@@ -20,7 +20,7 @@ from router.compiler.network import takes_from
 from router.compiler.resolution import PORT_IN_TESTS, sender_in_tests
 from router.datagrams import Peer
 from router.errors import Code, Located, SourceSpan, did_you_mean
-from router.hosts import LOOPBACK, bracketed
+from router.hosts import LOOPBACK, with_port
 from router.rehearsal.fields import ANY, FieldReader, Fields
 from router.rehearsal.stage import UNMATCHED
 from router.table.addresses import BadAddressError, is_host, parse_address
@@ -169,7 +169,7 @@ class Names:
             return sender_in_tests(self._table, endpoint)
         text = re.sub(r"^localhost(?=:|$)", LOOPBACK, name)
         try:
-            return parse_address(f"{bracketed(text)}:{PORT_IN_TESTS}" if is_host(text) else text)
+            return parse_address(with_port(text, PORT_IN_TESTS) if is_host(text) else text)
         except BadAddressError as error:
             message = f"'{name}' is neither HOST[:PORT] nor a name of the route table"
             raise InvalidValueError(

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from router.errors import Code, Diagnostic
-from router.hosts import bracketed, is_address, is_any, is_ipv6
+from router.hosts import is_address, is_any, is_ipv6, with_port
 from router.table.nodes import MappingNode, Node, Path, ScalarNode, SequenceNode
 from router.table.units import Quantity
 
@@ -51,7 +51,7 @@ class Address(NamedTuple):
         return is_ipv6(self.host)
 
     def __str__(self) -> str:
-        return self.host if self.is_learned else f"{bracketed(self.host)}:{self.port}"
+        return self.host if self.is_learned else with_port(self.host, self.port)
 
 
 LEARNED = Address("learned", 0)
@@ -191,7 +191,7 @@ def parse_endpoint(text: str) -> Address:
     if text == LEARNED.host:
         return LEARNED
     if is_host(text):
-        return TcpPlace(parse_remote(f"{bracketed(text)}:1").host, 0)
+        return TcpPlace(parse_remote(with_port(text, 1)).host, 0)
     host, _, port = text.rpartition(":")
     if NAME.fullmatch(host) and len(host) <= _LONGEST_NAME:
         return Address(host.lower(), parse_address(f"127.0.0.1:{port}").port)
@@ -330,7 +330,7 @@ def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool
             yield from _group_outside(f"'{key}' of {name}", node, group, networks)
             return
         address = parse_address(
-            locator["address"] if locator else node.text if has_port else f"{bracketed(node.text)}:1"
+            locator["address"] if locator else node.text if has_port else with_port(node.text, 1)
         )
     except BadAddressError:
         # A host name, a path; invalid addresses of other kinds already have a finding.

@@ -26,7 +26,7 @@ from router.compiler.topics import qos_of, resolved
 from router.datagrams import Peer, Wire
 from router.errors import ConfigurationError, UsageError, plural, shown_path
 from router.gateway.publishers import by_frequency
-from router.hosts import LOOPBACK, LOOPBACK_IPV6, bracketed
+from router.hosts import LOOPBACK, LOOPBACK_IPV6, with_port
 from router.rehearsal.describing import EventDescriber
 from router.rehearsal.fields import shown
 from router.rehearsal.rehearsal import Received, Rehearsal
@@ -233,7 +233,7 @@ def _source(name: str, table: RouteTable) -> str:
         address += f" from port {port}" if port else ""
         address += f" in {', '.join(map(str, endpoint.networks))}" if endpoint.networks else ""
     elif port is not None:
-        address = f"{bracketed(address)}:{port}"
+        address = with_port(address, port)
     by = f" by listener {endpoint.listener.value}" if endpoint.listener else ""
     return f"{name} ({address}{by})"
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
-from router.hosts import bracketed
+from router.hosts import with_port
 from router.observe.problems import Kind, Problem
 from router.observe.services import ServiceReading
 from router.observe.states import StateReading
@@ -194,7 +194,7 @@ def _control(url: str, patience: float) -> http.client.HTTPConnection:
 
 def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: str) -> http.client.HTTPResponse:
     host, _, _ = connection.host.partition("%")  # a zone is only for this computer
-    headers = {"Host": f"{bracketed(host)}:{connection.port}"}
+    headers = {"Host": with_port(host, connection.port)}
     try:
         connection.request(method, path, headers=headers | ({"Content-Length": "0"} if method == "POST" else {}))
         return connection.getresponse()

@@ -14,16 +14,11 @@ from router.net.multicast import route_index
 from router.net.ready import readable
 from router.net.sockets import ListeningSocket
 from tests.namespaces import Computer, cable, computers
+from tests.net.test_multicast import PATIENCE_S, PORT, index, rejoin, stack
+
+__all__ = ["stack"]
 
 GROUP, OTHER = "ff15::4", "ff15::5"
-PORT = 10006
-PATIENCE_S = 5
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as opened:
-        yield opened
 
 
 @pytest.fixture
@@ -60,15 +55,6 @@ def receives(opened: ListeningSocket, sending: Computer, group: str) -> bool:
         heard.append(opened.socket.recv(100).decode())
     assert heard == ["fd00::1", *[group] * has_arrived, "fd00::1"]
     return has_arrived
-
-
-def index(computer: Computer, interface: str = "eth0") -> int:
-    return computer.inside(lambda: socket.if_nametoindex(interface))
-
-
-def rejoin(opened: ListeningSocket, computer: Computer, *groups: str) -> dict[str, str]:
-    computer.inside(lambda: opened.follow_groups(groups))
-    return {**opened.missing_groups}
 
 
 @pytest.mark.parametrize("interface", ["eth0", None])

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Union
 from router.gateway.transport.arrival import LoopClock
 from router.gateway.transport.base import LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
-from router.hosts import bracketed
+from router.hosts import with_port
 from router.log import FloodLog, logger
 from router.net.addresses import bound_address
 from router.net.doors import Door
@@ -123,7 +123,7 @@ class StreamClient:
         peer = peer or ("a client that has left", 0)
         self.host: str = peer[0]
         self.own_host: str = (connection.get_extra_info("sockname") or ("", 0))[0]
-        self.label = f"{bracketed(self.host)}:{peer[1]}"
+        self.label = with_port(self.host, peer[1])
         self.unfinished_since: float | None = None
         self._owner = owner
         self._connection = connection
